@@ -1,12 +1,12 @@
 """Computes the parts of one large piece of work wherever the work around it may run."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import partial
 from itertools import islice
-from typing import TypeVar
+from typing import Final, TypeVar, cast
 
 from ballfg.parallel.executor import executor
 from ballfg.parallel.stream import in_order
@@ -15,6 +15,7 @@ from ballfg.parallel.work import each
 T = TypeVar("T")
 R = TypeVar("R")
 
+AHEAD: Final = 4  # Items of a generator that are made ahead
 _JOBS: ContextVar[int] = ContextVar("jobs", default=1)
 
 
@@ -62,3 +63,16 @@ def in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
+
+
+def read_ahead(items: Generator[T, None, None]) -> Iterator[T]:
+    """The items of a generator, the next few of which another thread makes; for libraries as of `in_threads`."""
+    end = object()
+    try:
+        with ThreadPoolExecutor(1) as thread:
+            pending = deque(thread.submit(next, items, end) for _ in range(AHEAD))
+            while (item := pending.popleft().result()) is not end:
+                pending.append(thread.submit(next, items, end))
+                yield cast("T", item)
+    finally:
+        items.close()

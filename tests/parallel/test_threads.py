@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
@@ -15,7 +15,7 @@ import pytest
 from ballfg.arrays import Array
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import ExtendedKalmanFilter, Online, Settings, Smoother
-from ballfg.parallel.parts import in_threads, with_jobs
+from ballfg.parallel.parts import AHEAD, in_threads, read_ahead, with_jobs
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.simulation.balls import table_tennis
 from ballfg.tracks import Track
@@ -147,3 +147,34 @@ def test_a_stream_in_threads_keeps_its_order_and_a_few_items_only(jobs: int) -> 
 
     with pytest.raises(ZeroDivisionError):
         with_jobs(jobs, lambda _: list(in_threads(wrong, range(9))), None)
+
+
+def test_another_thread_reads_a_few_items_ahead_and_leaves_with_the_reader() -> None:
+    read, closed = list[int](), list[bool]()
+
+    def numbers() -> Generator[int, None, None]:
+        try:
+            for number in range(30):
+                read.append(number)
+                yield number
+        finally:
+            closed.append(True)
+
+    assert list(read_ahead(numbers())) == list(range(30))
+    read.clear()
+    items = read_ahead(numbers())
+    assert [next(items) for _ in range(3)] == [0, 1, 2]
+    items.close()
+    assert len(read) <= 3 + AHEAD
+    assert closed == [True, True]
+
+
+def test_an_error_of_what_is_read_ahead_comes_after_the_items_before_it() -> None:
+    def broken() -> Generator[int, None, None]:
+        yield from range(6)
+        raise ValueError("the file ends in the middle")
+
+    seen = list[int]()
+    with pytest.raises(ValueError, match="in the middle"):
+        seen.extend(read_ahead(broken()))
+    assert seen == list(range(6))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.parallel.parts import in_threads
+from ballfg.parallel.parts import in_parts, in_threads
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.background import ALIKE, Match, linked
@@ -19,6 +20,7 @@ from ballfg.vision.broadcast.find import cameras_of, find_court
 from ballfg.vision.broadcast.graph import Solved, solve
 from ballfg.vision.broadcast.lines import REACHES, Ridges, brightness, corrected, moved, ridges, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole
+from ballfg.vision.one_thread import one_thread
 
 Frames = Callable[[], Iterator[tuple[float, Image]]]
 """Opens a video and gives stamps (s) and images (h, w, 3), BGR."""
@@ -121,20 +123,34 @@ def _first_pass(
             yield last, image
             last = image
 
-    links = list[Match | None]()
+    def look() -> int:
+        """Looks for the court in the waiting pictures; the number of those that show it."""
+        here = dict(zip(waiting, in_parts(partial(_found, court), list(waiting.values()), 1), strict=True))
+        waiting.clear()
+        seeds.update({k: cameras for k, cameras in here.items() if cameras})
+        return sum(map(bool, here.values()))
+
+    links, waiting = list[Match | None](), dict[int, Image]()
     for k, (image, link) in enumerate(in_threads(linked, watched(pairs()))):
         links.append(link)
         if link is None:
+            look()
             found, looked = 0, -np.inf
         if corners is not None:
             here = _of_corners(image, court, corners[k]) if k in corners else []
             seeds |= {k: here} if here else {}
         elif found < SEEDS and times[k] - looked >= EVERY:
-            looked = times[k]
-            here = likely(image, find_court(image, court)[:TRIED], court)
-            if here:
-                found, seeds[k] = found + 1, here
+            looked, waiting[k] = times[k], image
+            if found + len(waiting) == SEEDS:  # together, as none of them can make another one needless
+                found += look()
+    look()
     return np.array(times), links[1:], seeds
+
+
+@one_thread()  # pictures are shared out among processes
+def _found(court: Court, image: Image) -> list[tuple[Pinhole, float]]:
+    """The cameras that see the court in a picture."""
+    return likely(image, find_court(image, court)[:TRIED], court)
 
 
 def _of_corners(image: Image, court: Court, corners: Array) -> list[tuple[Pinhole, float]]:

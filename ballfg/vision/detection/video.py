@@ -2,7 +2,7 @@
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -13,6 +13,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.checks import check_path, listed, shown
 from ballfg.files.damaged import check_pixels
+from ballfg.parallel.parts import read_ahead
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
 from ballfg.vision.arrays import Image
@@ -44,7 +45,7 @@ class Video(ABC):
             the stamps or, by over 2 %, fewer than announced.
         """
         last, number = -np.inf, -1
-        for number, (stamp, image) in enumerate(self._decoded()):
+        for number, (stamp, image) in enumerate(read_ahead(self._decoded())):
             if self._stamps is not None:
                 if number >= len(self._stamps):
                     raise ValueError(self._mismatch("more"))
@@ -72,7 +73,7 @@ class Video(ABC):
         """Images spread over the recording. Returns: images (h, w, 3) uint8, at most `count`."""
 
     @abstractmethod
-    def _decoded(self) -> Iterator[tuple[float, Image]]:
+    def _decoded(self) -> Generator[tuple[float, Image], None, None]:
         """Each frame with the container's stamp."""
 
 
@@ -100,7 +101,7 @@ class VideoFile(Video):
         capture.release()
         return images
 
-    def _decoded(self) -> Iterator[tuple[float, Image]]:
+    def _decoded(self) -> Generator[tuple[float, Image], None, None]:
         capture = _capture(self.path)
         try:
             while (read := capture.read())[0]:
@@ -127,7 +128,7 @@ class ImageFolder(Video):
         few = min(count, self.count)
         return [self._image(self._files[turn * self.count // few]) for turn in range(few)]
 
-    def _decoded(self) -> Iterator[tuple[float, Image]]:
+    def _decoded(self) -> Generator[tuple[float, Image], None, None]:
         return ((np.nan, self._image(file)) for file in self._files)
 
     def _image(self, file: Path) -> Image:
