@@ -95,7 +95,7 @@ class _Writer:
                 return ir.Constant(REAL if isinstance(number, float) else WHOLE, number)
             case ast.Name(id=name):
                 return values[name]
-            case ast.Subscript(value=ast.Attribute(value=ast.Name(id=name)), slice=ast.Constant(value=dimension)):
+            case ast.Subscript(value=ast.Attribute(value=ast.Name(id=name)), slice=ast.Constant(value=int(dimension))):
                 return self._shapes[name][dimension]
             case ast.Subscript():
                 return self._builder.load(self._pointer(node, values))
