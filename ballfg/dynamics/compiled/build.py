@@ -1,5 +1,6 @@
 """Compiles generated source to machine code and keeps it on disk under the hash of that source."""
 
+import ast
 import hashlib
 import json
 import sys
@@ -15,6 +16,7 @@ from numba.core import cgutils
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
+from ballfg.dynamics.compiled.arithmetic import lowered
 from ballfg.dynamics.compiled.kept import Kept, keep, readable
 from ballfg.dynamics.compiled.signatures import FUNCTION
 from ballfg.files.json_file import read_json
@@ -118,7 +120,9 @@ def _built(text: str) -> Code:
     found = [path for path in readable(f"{name}.py") if _holds(path, text)]
     path = found[0] if found else keep(f"{name}.py", text)
     module = sys.modules[name] = ModuleType(name)  # Python's own cache, if damaged, would be an error at each start
-    exec(compile(text, path, "exec", dont_inherit=True), module.__dict__)
+    tree, loops = lowered(ast.parse(text))
+    module.__dict__.update(loops)
+    exec(compile(tree, path, "exec", dont_inherit=True), module.__dict__)
     module.compute._compile_for_args()
     return Code(module.compute)
 
