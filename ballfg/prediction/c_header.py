@@ -100,7 +100,8 @@ def c_header(model: BallModel, name: str, noise: ProcessNoise | None = None) -> 
     if functions is None:
         raise ValueError(f"model must have machine code to be exported; {type(model).__name__} runs in torch alone")
     translator, tables = Translator(name), list[str]()
-    bound = {"laws": _laws(name, model, functions, tables), "radius": Constant(functions.radius)}
+    *laws, rolling = _laws(name, model, functions, tables)
+    bound = {"laws": Laws(*laws), "rolling": rolling, "radius": Constant(functions.radius)}
     for function in (c_functions.fly, c_functions.contact, c_functions.predict, c_functions.cross_plane):
         routine = translator.routine(function)
         given = [argument.arg for argument in routine.tree.args.args if argument.arg not in bound]
@@ -123,8 +124,8 @@ def _argument(name: str) -> Value:
     return Scalar(name, kind) if isinstance(kind, str) else Array(name, kind, name)
 
 
-def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[str]) -> Laws:
-    """Rates, impact and surface with their coefficients and weights, which are written to the tables."""
+def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[str]) -> list[Law]:
+    """Rates, impact, surface and rolling with their coefficients and weights, which are written to the tables."""
     numbers = numbers_of(model)
 
     def law(part: str, function: Function, weights: Numbers) -> Law:
@@ -144,9 +145,8 @@ def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[st
             table(WEIGHTS, weights.tolist(), (len(weights),)),
         )
 
-    parts = (functions.rates, functions.impact, functions.surface)
-    named = zip(("rates", "impact", "surface"), parts, functions.weights(model), strict=True)
-    return Laws(*(law(*one) for one in named))
+    named = zip(("rates", "impact", "surface", "rolling"), functions.parts, functions.weights(model), strict=True)
+    return [law(*one) for one in named]
 
 
 def _in_lines(values: Sequence[float]) -> str:

@@ -1,4 +1,4 @@
-"""Compiles the functions of a ball model, rates, impact and surface, each with its tangents."""
+"""Compiles the functions of a ball model, rates, impact, surface and rolling, each with its tangents."""
 
 import sys
 import threading
@@ -53,40 +53,41 @@ class CompiledModel:
     rates: Function  # of the velocity, then of the spin, (6,)
     impact: Function  # state after an impact, (9,)
     surface: Function  # offset of surfaces above their declared heights in m, and their slopes along x and y, (3,)
+    rolling: Function  # rates of a ball that rests on a surface, (6,)
     radius: float  # m, of the ball
 
     @cached_property
-    def parts(self) -> tuple[Function, Function, Function]:
-        """Rates, impact and surface."""
-        return self.rates, self.impact, self.surface
+    def parts(self) -> tuple[Function, Function, Function, Function]:
+        """Rates, impact, surface and rolling."""
+        return self.rates, self.impact, self.surface, self.rolling
 
     @cached_property
-    def addresses(self) -> tuple[int, int, int]:
+    def addresses(self) -> tuple[int, ...]:
         """By which machine code takes them."""
-        return self.rates.compute.address, self.impact.compute.address, self.surface.compute.address
+        return tuple(part.compute.address for part in self.parts)
 
     @cached_property
     def _weighed(self) -> bool:
         """True if any of them has weights."""
         return any(part.weigh is not None for part in self.parts)
 
-    def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
-        """Weights of rates, impact and surface from a model's present tables."""
+    def weights(self, model: BallModel) -> tuple[Array, ...]:
+        """Weights of the `parts` from a model's present tables."""
         if not self._weighed:
-            return NONE, NONE, NONE
+            return (NONE,) * len(self.parts)
         tables = numbers_of(model).tables()
         now, known = stamp_of(tables), _weights.get(model)
         if known is None or known[0] != now:
             plain = [table.detach() for table in tables]
-            rates, impact, surface = (NONE if p.weigh is None else p.weigh(*plain).numpy() for p in self.parts)
-            known = _weights[model] = (now, tables, (rates, impact, surface))
+            found = tuple(NONE if p.weigh is None else p.weigh(*plain).numpy() for p in self.parts)
+            known = _weights[model] = (now, tables, found)
         return known[2]
 
 
 NONE: Final = np.zeros(0)  # The weights of a function without tables
-_Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, Array, Array]]
+_Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, ...]]
 """Stamp of a model's tables; these, kept so that no others get their place in memory and with it their stamp; the
-weights of rates, impact and surface that were computed from them."""
+weights of its functions that were computed from them."""
 _weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """Attributes of every module; its parameters, buffers and parts are compared by themselves."""
@@ -162,8 +163,7 @@ def _plain(value: object) -> Hashable:
 def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
         with doing("machine code for this model"):
-            rates, impact, surface = (_function(model, part, key) for part in PARTS)
-            made = CompiledModel(rates, impact, surface, model.radius)
+            made = CompiledModel(*(_function(model, part, key) for part in PARTS), model.radius)
             _compare_steps_once(model, made, key)
         return made
     except ImportError:
@@ -174,7 +174,14 @@ def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
 
 
 def _rates(model: BallModel, state: Tensor) -> Tensor:
-    acceleration, spin_rate = model.rates(state)
+    return _together(*model.rates(state))
+
+
+def _rolling(model: BallModel, state: Tensor) -> Tensor:
+    return _together(*model.roll(state))
+
+
+def _together(acceleration: Tensor, spin_rate: Tensor | None) -> Tensor:
     return torch.cat((acceleration, torch.zeros_like(acceleration) if spin_rate is None else spin_rate), dim=-1)
 
 
@@ -190,7 +197,7 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
     return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
 
 
-PARTS: Final = (_rates, _impact, _surface)  # The functions that are compiled: of a model and of a state (9,)
+PARTS: Final = (_rates, _impact, _surface, _rolling)  # The functions that are compiled: of a model and of a state (9,)
 
 
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief
-from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, level_below, over_table
+from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief, roll_belief
+from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past, gap_of, level_below, over_table, stays
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import glide, laws_of, value_of
-from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, ONE, REAL, TWO, several
+from ballfg.dynamics.compiled.flight import glide, law_at, laws_of, put, put_all, still, value_of
+from ballfg.dynamics.compiled.ground import place_on
+from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, ROLLING, TWO, several
 from ballfg.dynamics.motion.limits import MAX_STEP
 
 LOOKS = 16  # Number of looks in a step of `MAX_STEP`: two crossings within 1.25 ms may pass unseen
@@ -16,7 +17,7 @@ NEWTON_STEPS = 20  # Largest number of steps to a crossing; three or four are en
 TIME_TOLERANCE = 1e-12  # s. Accuracy of the time of a crossing
 INSTANT = 1e-9  # s, within which a ball that has already touched a surface bounces
 NONE, FOUND, HARD = 0.0, 1.0, 2.0
-"""Ends of a search: nothing within the horizon; the event; a step other than flight or a plain bounce."""
+"""Ends of a search: nothing within the horizon; the event; a step other than flight, rest or a plain bounce."""
 
 
 @machine_code(several(REAL, 2)(LAW, ONE, ONE, REAL))
@@ -47,6 +48,21 @@ def _exact(rates, x, normal, offset, low, high):
     return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
 
 
+@machine_code(REAL(ONE, TWO, REAL, ONE, TWO))
+def _reached(after, spread, h, mean, covariance):
+    """Copies mean (d,) and covariance (d, d) after a step of h s, which it returns."""
+    put(mean, after)
+    put_all(covariance, spread)
+    return h
+
+
+@machine_code(NOTHING(LAW, ONE, ONE))
+def _rates_at(rates, x, rate):
+    """The rate of change (9,) of a state (9,)."""
+    value_of(rates, x, rate[3:])
+    put(rate[:3], x[3:6])
+
+
 @machine_code(REAL(LAW, ONE, ONE, REAL, REAL, REAL, FLAG))
 def _zero(rates, x, normal, offset, h, earliest, either_way):
     """The first time after `earliest` in h s of free flight at which the value goes through zero; NaN: it does not.
@@ -74,12 +90,10 @@ def _zero(rates, x, normal, offset, h, earliest, either_way):
 def _contact_within(laws, x, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
 
-    It is unclear if the ball rests there, or falls past the table to the floor within the step. The third number is the
-    time at which it falls past the table, else NaN; writes its state there to touch (9,).
+    It is unclear if the ball falls past the table to the floor within the step. The third number is the time at which
+    it falls past the table, else NaN; writes its state there to touch (9,).
     """
     low, after = level_below(laws.surface, x, world), x.copy()
-    if at_rest(laws.surface, x, low, world):
-        return low, np.nan, np.nan
     glide(laws.rates, after, h, 1)
     if after[5] >= 0.0 or gap_of(laws.surface, after, low, world[2]) >= 0.0:
         return np.nan, h, np.nan
@@ -91,25 +105,39 @@ def _contact_within(laws, x, h, world, touch):
     return low, tau, np.nan
 
 
-@machine_code(several(REAL, 2)(*GIVEN, FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO))
+@machine_code(several(REAL, 2)(*GIVEN, *ROLLING, FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO, ONE))
 def find(
-    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws,
-    contact, either_way, normal, offset, earliest, horizon, world, noise, mean, covariance,
+    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, rolling, g, gt, wg,
+    contact, either_way, normal, offset, earliest, horizon, world, noise, mean, covariance, rate,
 ):  # fmt: skip
     """Carries one ball to an event, in place: its next contact, or the time when normal . x falls through an offset.
 
     Args:
-        c, b, s: coefficients of rates, impact and surface, (1, p) with tangents (1, p, d); w, wb, ws: their weights.
+        c, b, s, g: coefficients of rates, impact, surface and rolling, (1, p) with tangents (1, p, d); w, wb, ws, wg:
+            their weights.
         contact: look for the next contact.  either_way: count a rise through the offset too.  normal (9,).
         earliest, horizon: s from the start; only events after the one and up to the other count.
         world (11,), noise (5,): as `beliefs.carry`.
-    Writes: mean (d,) and covariance (d, d) at the event, or where the search ended.
+    Writes: mean (d,) and covariance (d, d) at the event, or where the search ended; the mean's rate of change there in
+        flight, or at rest, to rate (9,).
     Returns: `NONE`, `FOUND` or `HARD`, and the time (s) since the start.
     """
     d, passed, laws = len(mean), 0.0, laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     after, spread, x, touch = np.empty(d), np.empty((d, d)), mean[:9], np.empty(9)
+    grounded, none = law_at(rolling, g, gt, wg), np.empty((9, 0))
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
+        low = level_below(laws.surface, x, world)
+        if stays(laws, x, low, world):
+            place_on(still(laws.surface), x, none, low, world[2])
+            event = _zero(grounded, x, normal, offset, h, earliest - passed, either_way)  # none where normal is zero
+            h = event if math.isfinite(event) else h
+            roll_belief(laws, grounded, mean, covariance, h, low, noise, world[2], after, spread)
+            passed += _reached(after, spread, h, mean, covariance)
+            if math.isfinite(event):
+                _rates_at(grounded, x, rate)
+                return FOUND, passed
+            continue
         low, tau, past = _contact_within(laws, x, h, world, touch)
         touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
         if not (touched or 0.0 <= tau <= h):
@@ -131,9 +159,8 @@ def find(
                 return HARD, passed
             if past <= h and not falls_past(laws, covariance, touch, past, h, world, after, spread):
                 return HARD, passed
-        mean[:] = after
-        covariance[:] = spread
-        passed += h
+        passed += _reached(after, spread, h, mean, covariance)
         if math.isfinite(event):
+            _rates_at(laws.rates, x, rate)
             return FOUND, passed
     return NONE, passed
