@@ -56,12 +56,12 @@ TEXT: Final = """\
    int {p}_predict(world, noise, state, covariance, count, times, states, covariances)
      States and covariances at `count` times (s from now, not decreasing), without measurement noise. Near a contact
      they hold the balls that have bounced and those that have not. Returns how many are written: fewer where the ball
-     comes to rest or bounces several times within 20 ms, or where a time decreases.
+     lands or bounces several times within 20 ms, or where a time decreases.
    int {p}_cross_plane(world, noise, state, covariance, normal, offset, direction, horizon,
                        time, time_sigma, there, spread)
      The next crossing of normal . p = offset (m) by the centre within `horizon` s: its time and the standard deviation
      of it (s), the state there and its covariance on the plane. direction: 1 along the normal, -1 against it, 0 either.
-     Returns 1; 0: it does not cross; -1: an argument is not finite, or the ball rests or bounces several times before.
+     Returns 1; 0: it does not cross; -1: an argument is not finite, or the ball lands or bounces several times before.
 
    world[{world_size}]: m, height of the table and of the floor (-INFINITY: none), radius of the ball; the table's ends
      x_low, x_high, y_low, y_high (infinite: unknown) and their standard deviations.

@@ -186,18 +186,8 @@ def carry(
                 age[k + 1, r] = np.nan
             low, after = edges.level_below(laws.surface, x[:9], world), mean[k + 1, r]
             if edges.stays(laws, x[:9], low, world):
-                roll_belief(
-                    laws,
-                    only(grounded, r),
-                    x,
-                    covariance[k, r],
-                    step,
-                    low,
-                    noise,
-                    world[2],
-                    after,
-                    covariance[k + 1, r],
-                )
+                own, spread = only(grounded, r), covariance[k + 1, r]
+                roll_belief(laws, own, x, covariance[k, r], step, low, noise, world[2], after, spread)
                 continue
             if after[5] >= 0.0 or edges.gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:
                 continue

@@ -48,18 +48,21 @@ def _exact(rates, x, normal, offset, low, high):
     return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
 
 
-@machine_code(REAL(ONE, TWO, REAL, ONE, TWO))
-def _reached(after, spread, h, mean, covariance):
-    """Copies mean (d,) and covariance (d, d) after a step of h s, which it returns."""
-    put(mean, after)
-    put_all(covariance, spread)
-    return h
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, FLAG))
+def _next_zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
+    """`_zero` in flight or at rest; none where the normal is zero."""
+    if resting:
+        return _zero(rolling, x, normal, offset, h, earliest, either_way)
+    return _zero(rates, x, normal, offset, h, earliest, either_way)
 
 
-@machine_code(NOTHING(LAW, ONE, ONE))
-def _rates_at(rates, x, rate):
-    """The rate of change (9,) of a state (9,)."""
-    value_of(rates, x, rate[3:])
+@machine_code(NOTHING(LAW, LAW, FLAG, ONE, ONE))
+def _rates_at(rates, rolling, resting, x, rate):
+    """The rate of change (9,) of a state (9,) in flight or at rest."""
+    if resting:
+        value_of(rolling, x, rate[3:])
+    else:
+        value_of(rates, x, rate[3:])
     put(rate[:3], x[3:6])
 
 
@@ -127,28 +130,24 @@ def find(
     grounded, none = law_at(rolling, g, gt, wg), np.empty((9, 0))
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
-        low = level_below(laws.surface, x, world)
+        low, resting = level_below(laws.surface, x, world), False
         if stays(laws, x, low, world):
             place_on(still(laws.surface), x, none, low, world[2])
-            event = _zero(grounded, x, normal, offset, h, earliest - passed, either_way)  # none where normal is zero
-            h = event if math.isfinite(event) else h
-            roll_belief(laws, grounded, mean, covariance, h, low, noise, world[2], after, spread)
-            passed += _reached(after, spread, h, mean, covariance)
-            if math.isfinite(event):
-                _rates_at(grounded, x, rate)
-                return FOUND, passed
-            continue
-        low, tau, past = _contact_within(laws, x, h, world, touch)
+            tau, past, resting = h, np.nan, True
+        else:
+            low, tau, past = _contact_within(laws, x, h, world, touch)
         touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
         h, event = INSTANT if touched else tau, np.nan
         if not touched:
-            if not contact:
-                event = _zero(laws.rates, x, normal, offset, h, earliest - passed, either_way)
-            elif math.isfinite(low) and passed + h > earliest:
+            event = _next_zero(laws.rates, grounded, resting, x, normal, offset, h, earliest - passed, either_way)
+            if contact and not resting and math.isfinite(low) and passed + h > earliest:
                 event = h
-        if math.isfinite(low) and not math.isfinite(event):
+        if resting:
+            h = event if math.isfinite(event) else h
+            roll_belief(laws, grounded, mean, covariance, h, low, noise, world[2], after, spread)
+        elif math.isfinite(low) and not math.isfinite(event):
             if not bounce(laws, x, covariance, h, low, world, noise, after[:9], spread):
                 return HARD, passed
             after[9:] = mean[9:]
@@ -159,8 +158,10 @@ def find(
                 return HARD, passed
             if past <= h and not falls_past(laws, covariance, touch, past, h, world, after, spread):
                 return HARD, passed
-        passed += _reached(after, spread, h, mean, covariance)
+        put(mean, after)
+        put_all(covariance, spread)
+        passed += h
         if math.isfinite(event):
-            _rates_at(laws.rates, x, rate)
+            _rates_at(laws.rates, grounded, resting, x, rate)
             return FOUND, passed
     return NONE, passed
