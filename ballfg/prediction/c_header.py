@@ -126,14 +126,16 @@ def _argument(name: str) -> Value:
 
 def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[str]) -> list[Law]:
     """Rates, impact, surface and rolling with their coefficients and weights, which are written to the tables."""
-    numbers = numbers_of(model)
+    numbers, shared = numbers_of(model), dict[tuple[float, ...], str]()
 
     def law(part: str, function: Function, weights: Numbers) -> Law:
         def table(of: str, values: Sequence[float], shape: tuple[int, ...]) -> Array:
-            if values:
+            own = f"{name}_{part}_{of}"
+            called = shared.setdefault(tuple(values), own) if of == WEIGHTS else own
+            if values and called == own:
                 listed = _in_lines(values) if any(values) else "0.0"
-                tables.append(f"static const double {name}_{part}_{of}[{len(values)}] = {{{listed}}};")
-            return Array(f"{name}_{part}_{of}", shape, "", fixed=of == WEIGHTS)
+                tables.append(f"static const double {own}[{len(values)}] = {{{listed}}};")
+            return Array(called, shape, "", fixed=of == WEIGHTS)
 
         routine: Any = Routine.of_source(part, function.source, KNOWN)
         p, own = len(function.names), [numbers.value(one) for one in function.names]
