@@ -182,7 +182,10 @@ class BallModel(nn.Module, ABC):
 
         The air's forces act in the plane; friction acts until the ball rolls, and rolling resistance slows it.
         """
-        air, air_torque = self.rates(state)
+        return self.on_ground(state, *self.rates(state))
+
+    def on_ground(self, state: Tensor, air: Tensor, air_torque: Tensor | None) -> Rates:
+        """What the ground makes of the rates in flight: `roll` from (..., 3) m/s^2 and (..., 3) rad/s^2, or None."""
         velocity, spin = state[..., VELOCITY], state[..., SPIN]
         slip = slip_velocity(velocity, spin, self.radius)
         friction = -ROLLING_FRICTION * STANDARD_GRAVITY * _soft_direction(slip)

@@ -126,7 +126,7 @@ def _argument(name: str) -> Value:
 
 def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[str]) -> list[Law]:
     """Rates, impact, surface and rolling with their coefficients and weights, which are written to the tables."""
-    numbers, shared = numbers_of(model), dict[tuple[float, ...], str]()
+    numbers, shared, routines = numbers_of(model), dict[tuple[float, ...], str](), dict[str, Routine]()
 
     def law(part: str, function: Function, weights: Numbers) -> Law:
         def table(of: str, values: Sequence[float], shape: tuple[int, ...]) -> Array:
@@ -137,7 +137,7 @@ def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[st
                 tables.append(f"static const double {own}[{len(values)}] = {{{listed}}};")
             return Array(called, shape, "", fixed=of == WEIGHTS)
 
-        routine: Any = Routine.of_source(part, function.source, KNOWN)
+        routine: Any = _routine(part, function, routines)
         p, own = len(function.names), [numbers.value(one) for one in function.names]
         still = [0.0] * (p * STATE_DIM)
         return Law(
@@ -149,6 +149,17 @@ def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[st
 
     named = zip(("rates", "impact", "surface", "rolling"), functions.parts, functions.weights(model), strict=True)
     return [law(*one) for one in named]
+
+
+def _routine(name: str, function: Function, routines: dict[str, Routine]) -> Routine:
+    """The syntax of a function of a model, once for each source. Args: routines: those so far, by source."""
+    for part, source in {**function.calls, name: function.source}.items():
+        if source not in routines:
+            known = {called: routines[other] for called, other in function.calls.items() if other in routines}
+            routines[source] = Routine.of_source(
+                part, source, KNOWN | known, calls=source == function.source and bool(known)
+            )
+    return routines[function.source]
 
 
 def _in_lines(values: Sequence[float]) -> str:

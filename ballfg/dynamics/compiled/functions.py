@@ -1,11 +1,12 @@
 """Compiles the functions of a ball model, rates, impact, surface and rolling, each with its tangents."""
 
+import inspect
 import sys
 import threading
 import warnings
 import weakref
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Final
@@ -30,6 +31,7 @@ from ballfg.state import STATE_DIM
 
 VALUES_AGREE: Final = 1e-12  # Largest relative difference between a compiled value and torch's
 SLOPES_AGREE: Final = 1e-10  # Largest relative difference between a compiled derivative and torch's
+VERSIONS: Final = f"torch {torch.__version__}, numba {numba.__version__}"
 COMPARED: Final = 4  # Number of random states at which both are computed
 
 
@@ -44,6 +46,7 @@ class Function:
     size: int  # m
     weigh: Recipe | None = None  # computes the weights from a model's tables; None if there are none
     source: str = ""  # of `compute`; empty where torch computes
+    calls: Mapping[str, str] = field(default_factory=dict)  # sources of the functions that it calls, by their names
 
 
 @dataclass(frozen=True)
@@ -163,7 +166,8 @@ def _plain(value: object) -> Hashable:
 def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
         with doing("machine code for this model"):
-            made = CompiledModel(*(_function(model, part, key) for part in PARTS), model.radius)
+            rates, impact, surface = (_function(model, part, key) for part in PARTS[:-1])
+            made = CompiledModel(rates, impact, surface, _on_ground(model, rates), model.radius)
             _compare_steps_once(model, made, key)
         return made
     except ImportError:
@@ -197,7 +201,14 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
     return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
 
 
-PARTS: Final = (_rates, _impact, _surface, _rolling)  # The functions that are compiled: of a model and of a state (9,)
+ON_GROUND: Final = """\
+def compute(x, c, w, xt, ct, y, yt):
+    air, airt = np.empty((len(x), 6)), np.empty((len(x), 6, xt.shape[2]))
+    rates(x, c, w, xt, ct, air, airt)
+    ground(x, air, w, xt, airt, y, yt)
+"""
+"""Source of rolling."""
+PARTS: Final = (_rates, _impact, _surface, _rolling)  # Functions of a model and of a state (9,)
 
 
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:
@@ -226,11 +237,34 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
     return made
 
 
+def _on_ground(model: BallModel, rates: Function) -> Function:
+    """Rolling: the rates in flight, then what the ground makes of them, so that a network is compiled once."""
+    own = type(model).on_ground is BallModel.on_ground
+    about = f"{model.radius!r}, {model.inertia_factor!r}, {source_stamp(inspect.getfile(BallModel))}, {_generator()}"
+    known = f"ground, {about}, {VERSIONS}"
+    kept = read_note(known) if own else None
+    if kept is None:
+        from ballfg.dynamics.compiled.translation.source import function_source
+        from ballfg.dynamics.compiled.translation.trace import trace
+
+        traced = trace(lambda x, air: _together(*model.on_ground(x, air[:3], air[3:])), [STATE_DIM, rates.size], [])
+        source = function_source(traced, *traced.inputs)
+        if own:
+            write_note(known, {"source": source})
+    else:
+        source = kept["source"]
+    built(source)
+    calls = {"rates": rates.source, "ground": source}
+    made = Function(built(ON_GROUND, calls), rates.names, rates.size, rates.weigh, ON_GROUND, calls)
+    if kept is None or not _is_of_package(model):
+        _compare(model, _rolling, made)
+    return made
+
+
 def _about(name: str, model: BallModel, key: Hashable | None) -> str | None:
     """The key of a note on a model of some structure; None if its parts have no files or cannot be compared."""
     files = None if key is None else _files_of(model)
-    versions = f"torch {torch.__version__}, numba {numba.__version__}"
-    return None if files is None else f"{name}, {key}, {files}, {_generator()}, {versions}"
+    return None if files is None else f"{name}, {key}, {files}, {_generator()}, {VERSIONS}"
 
 
 @cache
