@@ -7,8 +7,7 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief, roll_belief
 from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past, gap_of, level_below, over_table, stays
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import glide, law_at, laws_of, put, put_all, still, value_of
-from ballfg.dynamics.compiled.ground import place_on
+from ballfg.dynamics.compiled.flight import glide, law_at, laws_of, put, put_all, value_of
 from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, ROLLING, TWO, several
 from ballfg.dynamics.motion.limits import MAX_STEP
 
@@ -18,42 +17,6 @@ TIME_TOLERANCE = 1e-12  # s. Accuracy of the time of a crossing
 INSTANT = 1e-9  # s, within which a ball that has already touched a surface bounces
 NONE, FOUND, HARD = 0.0, 1.0, 2.0
 """Ends of a search: nothing within the horizon; the event; a step other than flight, rest or a plain bounce."""
-
-
-@machine_code(several(REAL, 2)(LAW, ONE, ONE, REAL))
-def _value(rates, x, normal, offset):
-    """Normal . x - offset of a state (9,), and its time derivative."""
-    a, value, rate = np.empty(6), -offset, 0.0
-    value_of(rates, x, a)
-    for i in range(9):
-        value += normal[i] * x[i]
-        rate += normal[i] * (x[3 + i] if i < 3 else a[i - 3])
-    return value, rate
-
-
-@machine_code(REAL(LAW, ONE, ONE, REAL, REAL, REAL))
-def _exact(rates, x, normal, offset, low, high):
-    """The time (s) between two others at which the value is zero in flight from x; NaN where Newton leaves them."""
-    at, tau, margin = np.empty(9), 0.5 * (low + high), 0.5 * (high - low)
-    for _ in range(NEWTON_STEPS):
-        at[:] = x
-        glide(rates, at, tau, 1)
-        value, rate = _value(rates, at, normal, offset)
-        move = -value / rate
-        tau += move
-        if not low - margin <= tau <= high + margin:
-            return np.nan
-        if abs(move) < TIME_TOLERANCE:
-            return tau
-    return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
-
-
-@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, FLAG))
-def _next_zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
-    """`_zero` in flight or at rest; none where the normal is zero."""
-    if resting:
-        return _zero(rolling, x, normal, offset, h, earliest, either_way)
-    return _zero(rates, x, normal, offset, h, earliest, either_way)
 
 
 @machine_code(NOTHING(LAW, LAW, FLAG, ONE, ONE))
@@ -66,23 +29,58 @@ def _rates_at(rates, rolling, resting, x, rate):
     put(rate[:3], x[3:6])
 
 
-@machine_code(REAL(LAW, ONE, ONE, REAL, REAL, REAL, FLAG))
-def _zero(rates, x, normal, offset, h, earliest, either_way):
-    """The first time after `earliest` in h s of free flight at which the value goes through zero; NaN: it does not.
+@machine_code(several(REAL, 2)(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, ONE))
+def _value(rates, rolling, resting, x, normal, offset, after, at):
+    """Normal . x - offset of a state (9,) some s later in flight or at rest, and its time derivative.
+
+    Args: at (9,): working memory.
+    """
+    change, value, rate = np.empty(9), -offset, 0.0
+    put(at, x)
+    if resting:
+        glide(rolling, at, after, 1)
+    else:
+        glide(rates, at, after, 1)
+    _rates_at(rates, rolling, resting, at, change)
+    for i in range(9):
+        value += normal[i] * at[i]
+        rate += normal[i] * change[i]
+    return value, rate
+
+
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL))
+def _exact(rates, rolling, resting, x, normal, offset, low, high):
+    """The time (s) between two others at which the value is zero on the way from x; NaN where Newton leaves them."""
+    at, tau, margin = np.empty(9), 0.5 * (low + high), 0.5 * (high - low)
+    for _ in range(NEWTON_STEPS):
+        value, rate = _value(rates, rolling, resting, x, normal, offset, tau, at)
+        move = -value / rate
+        tau += move
+        if not low - margin <= tau <= high + margin:
+            return np.nan
+        if abs(move) < TIME_TOLERANCE:
+            return tau
+    return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
+
+
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, FLAG))
+def _zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
+    """The first time after `earliest` in h s, of free flight or of rest, at which the value goes through zero.
+
+    NaN: it does not, as where the normal is zero.
 
     Looks are at the cubic through the values and their rates at both ends, which is right to a micrometre.
     """
-    end = x.copy()
-    glide(rates, end, h, 1)
-    low, low_rate = _value(rates, x, normal, offset)
-    high, high_rate = _value(rates, end, normal, offset)
+    at = np.empty(9)
+    low, low_rate = _value(rates, rolling, resting, x, normal, offset, 0.0, at)
+    high, high_rate = _value(rates, rolling, resting, x, normal, offset, h, at)
     before = low
     for look in range(1, LOOKS + 1):
         t = look / LOOKS
         bend = (1.0 - t) * (low_rate * h - (high - low)) - t * (high_rate * h - (high - low))
         value = low + t * (high - low) + t * (1.0 - t) * bend
         if (before > 0.0 and value <= 0.0) or (either_way and before < 0.0 and value >= 0.0):
-            tau = _exact(rates, x, normal, offset, (look - 1) * h / LOOKS, look * h / LOOKS)
+            tau = _exact(rates, rolling, resting, x, normal, offset, (look - 1) * h / LOOKS, look * h / LOOKS)
             if tau > earliest:
                 return tau
         before = value
@@ -127,12 +125,14 @@ def find(
     """
     d, passed, laws = len(mean), 0.0, laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     after, spread, x, touch = np.empty(d), np.empty((d, d)), mean[:9], np.empty(9)
-    grounded, none = law_at(rolling, g, gt, wg), np.empty((9, 0))
+    grounded = law_at(rolling, g, gt, wg)
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
         low, resting = level_below(laws.surface, x, world), False
         if stays(laws, x, low, world):
-            place_on(still(laws.surface), x, none, low, world[2])
+            roll_belief(laws, grounded, mean, covariance, 0.0, low, noise, world[2], after, spread)  # exactly on it
+            put(mean, after)
+            put_all(covariance, spread)
             tau, past, resting = h, np.nan, True
         else:
             low, tau, past = _contact_within(laws, x, h, world, touch)
@@ -141,7 +141,7 @@ def find(
             return HARD, passed
         h, event = INSTANT if touched else tau, np.nan
         if not touched:
-            event = _next_zero(laws.rates, grounded, resting, x, normal, offset, h, earliest - passed, either_way)
+            event = _zero(laws.rates, grounded, resting, x, normal, offset, h, earliest - passed, either_way)
             if contact and not resting and math.isfinite(low) and passed + h > earliest:
                 event = h
         if resting:
