@@ -126,12 +126,12 @@ def _argument(name: str) -> Value:
 
 def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[str]) -> list[Law]:
     """Rates, impact, surface and rolling with their coefficients and weights, which are written to the tables."""
-    numbers, shared, routines = numbers_of(model), dict[tuple[float, ...], str](), dict[str, Routine]()
+    numbers, shared, routines = numbers_of(model), dict[tuple[str | float, ...], str](), dict[str, Routine]()
 
     def law(part: str, function: Function, weights: Numbers) -> Law:
         def table(of: str, values: Sequence[float], shape: tuple[int, ...]) -> Array:
             own = f"{name}_{part}_{of}"
-            called = shared.setdefault(tuple(values), own) if of == WEIGHTS else own
+            called = shared.setdefault((of, *values), own)
             if values and called == own:
                 listed = _in_lines(values) if any(values) else "0.0"
                 tables.append(f"static const double {own}[{len(values)}] = {{{listed}}};")

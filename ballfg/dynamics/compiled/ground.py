@@ -67,7 +67,7 @@ def advance_step(laws, rolling, x, xt, h, world, times, levels):
     d, bounces, left, level, longest = xt.shape[1], 0, h, level_below(laws.surface, x, world), np.full(1, LONGEST_FALL)
     after, aftert, leftt, tau, taut = x.copy(), xt.copy(), np.zeros(d), np.empty(1), np.empty((1, d))
     for contact in range(MAX_CONTACTS + 1):
-        if stays(laws, x, level, world):
+        if stays(laws.rates, laws.surface, x, level, world):
             place_on(laws.surface, x, xt, level, world[2])
             fly_one(rolling, x, xt, left, leftt, steps_over(abs(left)))
             return bounces

@@ -137,15 +137,15 @@ def fly_belief(rates, mean, covariance, h, noise, after, spread):
     add_flight(spread, h, noise)
 
 
-@machine_code(NOTHING(LAWS, LAW, ONE, TWO, REAL, REAL, ONE, REAL, ONE, TWO))
-def roll_belief(laws, rolling, mean, covariance, h, level, noise, radius, after, spread):
-    """H s of one ball at rest on the surface at a level (m). Writes its mean (d,) and covariance (d, d)."""
+@machine_code(NOTHING(LAW, LAW, ONE, TWO, REAL, REAL, ONE, REAL, ONE, TWO))
+def roll_belief(surface, rolling, mean, covariance, h, level, noise, radius, after, spread):
+    """`fly_belief` at rest on the surface at a level (m)."""
     d = len(mean)
     jacobian = np.zeros((9, d))
     for i in range(9):
         jacobian[i, i] = 1.0
     after[:] = mean
-    place_on(laws.surface, after[:9], jacobian, level, radius)
+    place_on(surface, after[:9], jacobian, level, radius)
     fly_one(rolling, after[:9], jacobian, h, np.zeros(d), 1)
     through(jacobian, covariance, spread)
     add_flight(spread, h, noise)
@@ -185,9 +185,9 @@ def carry(
             else:
                 age[k + 1, r] = np.nan
             low, after = edges.level_below(laws.surface, x[:9], world), mean[k + 1, r]
-            if edges.stays(laws, x[:9], low, world):
+            if edges.stays(laws.rates, laws.surface, x[:9], low, world):
                 own, spread = only(grounded, r), covariance[k + 1, r]
-                roll_belief(laws, own, x, covariance[k, r], step, low, noise, world[2], after, spread)
+                roll_belief(laws.surface, own, x, covariance[k, r], step, low, noise, world[2], after, spread)
                 continue
             if after[5] >= 0.0 or edges.gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:
                 continue

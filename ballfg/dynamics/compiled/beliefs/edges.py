@@ -46,16 +46,16 @@ def is_slow(x):
     return abs(x[5]) <= REST_SPEED / 2
 
 
-@machine_code(FLAG(LAWS, ONE, REAL, ONE))
-def stays(laws, x, level, world):
+@machine_code(FLAG(LAW, LAW, ONE, REAL, ONE))
+def stays(rates, surface, x, level, world):
     """True if a state (9,) rests on the surface at a level (m), and its weight keeps it there."""
     if not is_slow(x) or (level == world[0] and not over_table(x, world)):
         return False
-    if not abs(gap_of(laws.surface, x, level, world[2])) <= REST_GAP:
+    if not abs(gap_of(surface, x, level, world[2])) <= REST_GAP:
         return False
-    rates = np.empty(6)
-    value_of(laws.rates, x, rates)
-    return rates[2] <= 0.0
+    change = np.empty(6)
+    value_of(rates, x, change)
+    return change[2] <= 0.0
 
 
 @machine_code(REAL(ONE, TWO, ONE))

@@ -7,7 +7,7 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief, roll_belief
 from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past, gap_of, level_below, over_table, stays
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import glide, law_at, laws_of, put, put_all, value_of
+from ballfg.dynamics.compiled.flight import fly_one, glide, law_at, laws_of, put, put_all, value_of
 from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, ROLLING, TWO, several
 from ballfg.dynamics.motion.limits import MAX_STEP
 
@@ -31,14 +31,15 @@ def _rates_at(rates, rolling, resting, x, rate):
 
 @machine_code(several(REAL, 2)(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, ONE))
 def _value(rates, rolling, resting, x, normal, offset, after, at):
-    """Normal . x - offset of a state (9,) some s later in flight or at rest, and its time derivative.
+    """Normal . x - offset some s after a state (9,), and its time derivative.
 
     Args: at (9,): working memory.
     """
     change, value, rate = np.empty(9), -offset, 0.0
     put(at, x)
-    if resting:
-        glide(rolling, at, after, 1)
+    if resting:  # with tangents, though unused: exported C is shorter with one form
+        d = rolling.ct.shape[2]
+        fly_one(rolling, at, np.zeros((9, d)), after, np.zeros(d), 1)
     else:
         glide(rates, at, after, 1)
     _rates_at(rates, rolling, resting, at, change)
@@ -87,14 +88,14 @@ def _zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
     return np.nan
 
 
-@machine_code(several(REAL, 3)(LAWS, ONE, REAL, ONE, ONE))
-def _contact_within(laws, x, h, world, touch):
+@machine_code(several(REAL, 3)(LAWS, REAL, ONE, REAL, ONE, ONE))
+def _contact_within(laws, low, x, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
 
     It is unclear if the ball falls past the table to the floor within the step. The third number is the time at which
     it falls past the table, else NaN; writes its state there to touch (9,).
     """
-    low, after = level_below(laws.surface, x, world), x.copy()
+    after = x.copy()
     glide(laws.rates, after, h, 1)
     if after[5] >= 0.0 or gap_of(laws.surface, after, low, world[2]) >= 0.0:
         return np.nan, h, np.nan
@@ -129,13 +130,12 @@ def find(
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
         low, resting = level_below(laws.surface, x, world), False
-        if stays(laws, x, low, world):
-            roll_belief(laws, grounded, mean, covariance, 0.0, low, noise, world[2], after, spread)  # exactly on it
-            put(mean, after)
-            put_all(covariance, spread)
+        if stays(laws.rates, laws.surface, x, low, world):
+            x[2] -= gap_of(laws.surface, x, low, world[2])
+            x[5] = 0.0
             tau, past, resting = h, np.nan, True
         else:
-            low, tau, past = _contact_within(laws, x, h, world, touch)
+            low, tau, past = _contact_within(laws, low, x, h, world, touch)
         touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
@@ -146,7 +146,7 @@ def find(
                 event = h
         if resting:
             h = event if math.isfinite(event) else h
-            roll_belief(laws, grounded, mean, covariance, h, low, noise, world[2], after, spread)
+            roll_belief(laws.surface, grounded, mean, covariance, h, low, noise, world[2], after, spread)
         elif math.isfinite(low) and not math.isfinite(event):
             if not bounce(laws, x, covariance, h, low, world, noise, after[:9], spread):
                 return HARD, passed
