@@ -96,7 +96,8 @@ def in_torch(model: BallModel) -> InTorch:
         for number, part in zip(numbers, PARTS, strict=True):
             _asked[number] = partial(_value, known, part, names)
             weakref.finalize(model, _asked.pop, number)
-        _made[model] = InTorch(*(Function(_code(), names, size) for size in SIZES), model.radius, numbers)
+        rates, impact, surface, rolling = (Function(_code(), names, size) for size in SIZES)
+        _made[model] = InTorch(rates, impact, surface, rolling, model.radius, numbers)
     return _made[model]
 
 
