@@ -21,9 +21,9 @@ from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import THREE, TWO
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian
+from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.dynamics.motion.limits import step_count, steps_over
-from ballfg.dynamics.motion.rollout import roll
+from ballfg.dynamics.motion.rollout import roll, roll_jacobian
 from ballfg.dynamics.motion.step_twice import flight_step
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
 from ballfg.factors.noise import Kicks, ProcessNoise, along_all_axes, whitening, whitening_tensor
@@ -254,13 +254,12 @@ class RestFactors(SurfaceFactors):
     """
 
     def prepared(self) -> Self:
-        """The same factors: torch rolls the ball."""
+        """The same factors: their rows are computed one by one."""
         return self
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""
-        dt, height = self._tensor(self.dt[rows]), self._tensor(self.heights[rows])
-        return batch_jacobian(lambda at: roll(self.model, at, dt, height), state)
+        return roll_jacobian(self.model, state, self._tensor(self.dt[rows]), self._tensor(self.heights[rows]))
 
     def transition(self, state: Tensor) -> Tensor:
         """Rolling over dt."""

@@ -12,8 +12,7 @@ import pytest
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.compiled import motion
-from ballfg.dynamics.compiled.beliefs import course
+from ballfg.dynamics.compiled import in_torch, motion
 from ballfg.dynamics.compiled.functions import CompiledModel
 from ballfg.machine import collect_rarely
 from ballfg.progress import VARIABLE
@@ -43,7 +42,7 @@ def every_effect() -> AnalyticModel:
 
 @contextmanager
 def _in_torch() -> Iterator[None]:
-    machine_code, of_beliefs = motion.functions_of, course.compiled
+    machine_code, of_beliefs = motion.functions_of, in_torch.compiled
 
     def functions_of(model: BallModel) -> CompiledModel | None:
         alone = model.model if isinstance(model, AugmentedModel) else model
@@ -54,7 +53,7 @@ def _in_torch() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(motion, "functions_of", functions_of)
-        patch.setattr(course, "compiled", compiled)
+        patch.setattr(in_torch, "compiled", compiled)
         yield
 
 

@@ -182,18 +182,19 @@ class BallModel(nn.Module, ABC):
 
         The air's forces act in the plane; friction acts until the ball rolls, and rolling resistance slows it.
         """
-        air, air_torque = self.rates(state)
+        return self.on_ground(state, *self.rates(state))
+
+    def on_ground(self, state: Tensor, air: Tensor, air_torque: Tensor | None) -> Rates:
+        """What the ground makes of the rates in flight: `roll` from (..., 3) m/s^2 and (..., 3) rad/s^2, or None."""
         velocity, spin = state[..., VELOCITY], state[..., SPIN]
         slip = slip_velocity(velocity, spin, self.radius)
         friction = -ROLLING_FRICTION * STANDARD_GRAVITY * _soft_direction(slip)
         resistance = -ROLLING_RESISTANCE * STANDARD_GRAVITY * _soft_direction(velocity[..., :2])
         kick = friction / (self.inertia_factor * self.radius)
-        slowing = resistance / self.radius  # keeps a rolling ball rolling
-        torque_x = kick[..., 1] - slowing[..., 1]
-        torque_y = -kick[..., 0] + slowing[..., 0]
-        zero = torch.zeros_like(torque_x)
+        turn = kick - resistance / self.radius  # the latter keeps a rolling ball rolling
+        zero = torch.zeros_like(turn[..., 0])
         acceleration = torch.cat((air[..., :2] + friction + resistance, zero[..., None]), dim=-1)
-        torque = torch.stack((torque_x, torque_y, zero), dim=-1)
+        torque = torch.stack((turn[..., 1], -turn[..., 0], zero), dim=-1)
         return acceleration, torque if air_torque is None else torque + air_torque
 
 

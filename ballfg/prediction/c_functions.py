@@ -11,7 +11,7 @@ from ballfg.dynamics.compiled.beliefs.carry import carry
 from ballfg.dynamics.compiled.beliefs.events import FOUND, INSTANT, NONE, find
 from ballfg.dynamics.compiled.beliefs.mixture import mix
 from ballfg.dynamics.compiled.contacts import meet
-from ballfg.dynamics.compiled.flight import fly_one, put, value_of
+from ballfg.dynamics.compiled.flight import fly_one, put
 from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, steps_over
 
 
@@ -50,7 +50,7 @@ def contact(laws, radius, state, height, longest, tau, after, jacobian):
     return not math.isnan(time[0])
 
 
-def predict(laws, world, noise, state, covariance, count, times, states, covariances):
+def predict(laws, rolling, world, noise, state, covariance, count, times, states, covariances):
     """States and covariances of a ball at `count` times (s from now, not decreasing), through plain bounces."""
     rates, impact, surface = laws
     mean, spread, beside, besides = (
@@ -70,6 +70,7 @@ def predict(laws, world, noise, state, covariance, count, times, states, covaria
             if carry(
                 rates.compute, impact.compute, surface.compute, rates.c, rates.ct, impact.c, impact.ct,
                 surface.c, surface.ct, rates.w, impact.w, surface.w,
+                rolling.compute, rolling.c, rolling.ct, rolling.w,
                 h, world, noise, mean, spread, beside, besides, level, age, hard,
             ) != 1:  # fmt: skip
                 return k
@@ -85,13 +86,13 @@ def predict(laws, world, noise, state, covariance, count, times, states, covaria
 
 
 def cross_plane(
-    laws, world, noise, state, covariance, normal, offset, direction, horizon, time, time_sigma, there, spread
+    laws, rolling, world, noise, state, covariance, normal, offset, direction, horizon, time, time_sigma, there, spread
 ):  # fmt: skip
     """The next crossing of the plane normal . p = offset by the ball's centre.
 
     The covariance is projected onto the plane, as `crossing.plane_crossing` does.
     """
-    line, rate, moved = np.zeros(9), np.empty(9), np.zeros(9)
+    line, rate, moved = np.zeros(9), np.empty(9), np.empty(9)
     length = math.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     sign = -1.0 if direction > 0 else 1.0
     if not (length > 0.0 and math.isfinite(length + offset) and horizon > 0.0 and math.isfinite(horizon)):
@@ -104,15 +105,14 @@ def cross_plane(
     end, elapsed = find(
         rates.compute, impact.compute, surface.compute, rates.c, rates.ct, impact.c, impact.ct,
         surface.c, surface.ct, rates.w, impact.w, surface.w,
-        False, direction == 0, line, sign * (offset / length), INSTANT, horizon, world, noise, there, spread,
+        rolling.compute, rolling.c, rolling.ct, rolling.w,
+        False, direction == 0, line, sign * (offset / length), INSTANT, horizon, world, noise, there, spread, rate,
     )  # fmt: skip
     time[0], time_sigma[0] = elapsed, np.inf
     if end != FOUND:
         return 0 if end == NONE else -1
-    value_of(rates, there, moved[3:])
     closing = 0.0
     for i in range(9):
-        rate[i] = there[3 + i] if i < 3 else moved[i]
         closing += line[i] * rate[i]
     if closing == 0.0:
         return 1

@@ -56,12 +56,12 @@ TEXT: Final = """\
    int {p}_predict(world, noise, state, covariance, count, times, states, covariances)
      States and covariances at `count` times (s from now, not decreasing), without measurement noise. Near a contact
      they hold the balls that have bounced and those that have not. Returns how many are written: fewer where the ball
-     comes to rest or bounces several times within 20 ms, or where a time decreases.
+     lands or bounces several times within 20 ms, or where a time decreases.
    int {p}_cross_plane(world, noise, state, covariance, normal, offset, direction, horizon,
                        time, time_sigma, there, spread)
      The next crossing of normal . p = offset (m) by the centre within `horizon` s: its time and the standard deviation
      of it (s), the state there and its covariance on the plane. direction: 1 along the normal, -1 against it, 0 either.
-     Returns 1; 0: it does not cross; -1: an argument is not finite, or the ball rests or bounces several times before.
+     Returns 1; 0: it does not cross; -1: an argument is not finite, or the ball lands or bounces several times before.
 
    world[{world_size}]: m, height of the table and of the floor (-INFINITY: none), radius of the ball; the table's ends
      x_low, x_high, y_low, y_high (infinite: unknown) and their standard deviations.
@@ -100,7 +100,8 @@ def c_header(model: BallModel, name: str, noise: ProcessNoise | None = None) -> 
     if functions is None:
         raise ValueError(f"model must have machine code to be exported; {type(model).__name__} runs in torch alone")
     translator, tables = Translator(name), list[str]()
-    bound = {"laws": _laws(name, model, functions, tables), "radius": Constant(functions.radius)}
+    *laws, rolling = _laws(name, model, functions, tables)
+    bound = {"laws": Laws(*laws), "rolling": rolling, "radius": Constant(functions.radius)}
     for function in (c_functions.fly, c_functions.contact, c_functions.predict, c_functions.cross_plane):
         routine = translator.routine(function)
         given = [argument.arg for argument in routine.tree.args.args if argument.arg not in bound]
@@ -123,18 +124,20 @@ def _argument(name: str) -> Value:
     return Scalar(name, kind) if isinstance(kind, str) else Array(name, kind, name)
 
 
-def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[str]) -> Laws:
-    """Rates, impact and surface with their coefficients and weights, which are written to the tables."""
-    numbers = numbers_of(model)
+def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[str]) -> list[Law]:
+    """Rates, impact, surface and rolling with their coefficients and weights, which are written to the tables."""
+    numbers, shared, routines = numbers_of(model), dict[tuple[str | float, ...], str](), dict[str, Routine]()
 
     def law(part: str, function: Function, weights: Numbers) -> Law:
         def table(of: str, values: Sequence[float], shape: tuple[int, ...]) -> Array:
-            if values:
+            own = f"{name}_{part}_{of}"
+            called = shared.setdefault((of, *values), own)
+            if values and called == own:
                 listed = _in_lines(values) if any(values) else "0.0"
-                tables.append(f"static const double {name}_{part}_{of}[{len(values)}] = {{{listed}}};")
-            return Array(f"{name}_{part}_{of}", shape, "", fixed=of == WEIGHTS)
+                tables.append(f"static const double {own}[{len(values)}] = {{{listed}}};")
+            return Array(called, shape, "", fixed=of == WEIGHTS)
 
-        routine: Any = Routine.of_source(part, function.source, KNOWN)
+        routine: Any = _routine(part, function, routines)
         p, own = len(function.names), [numbers.value(one) for one in function.names]
         still = [0.0] * (p * STATE_DIM)
         return Law(
@@ -144,9 +147,19 @@ def _laws(name: str, model: BallModel, functions: CompiledModel, tables: list[st
             table(WEIGHTS, weights.tolist(), (len(weights),)),
         )
 
-    parts = (functions.rates, functions.impact, functions.surface)
-    named = zip(("rates", "impact", "surface"), parts, functions.weights(model), strict=True)
-    return Laws(*(law(*one) for one in named))
+    named = zip(("rates", "impact", "surface", "rolling"), functions.parts, functions.weights(model), strict=True)
+    return [law(*one) for one in named]
+
+
+def _routine(name: str, function: Function, routines: dict[str, Routine]) -> Routine:
+    """The syntax of a function of a model, once for each source. Args: routines: those so far, by source."""
+    for part, source in {**function.calls, name: function.source}.items():
+        if source not in routines:
+            known = {called: routines[other] for called, other in function.calls.items() if other in routines}
+            routines[source] = Routine.of_source(
+                part, source, KNOWN | known, calls=source == function.source and bool(known)
+            )
+    return routines[function.source]
 
 
 def _in_lines(values: Sequence[float]) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.beliefs.course import BOUNCES, Carrier, Course, density_of
+from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, density_of
 from ballfg.dynamics.compiled.beliefs.edges import share_over_table
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
@@ -70,7 +70,7 @@ class Found:
     """The result of a search for an event.
 
     Attributes:
-        end: `events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge.
+        end: `events.NONE`, `FOUND`, or `HARD` before a landing, several bounces, or a bounce at a table's edge.
         belief: at the end.  gradient: (9 + p,) of the event there.  rate: (9 + p,) 1/s, the state's rate of change.
     """
 
@@ -146,10 +146,9 @@ class Propagator:
         """
         start = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy())
         carrier = self._carrier(belief)
-        end, elapsed, course = carrier.find(start, horizon, earliest, line, either_way=either_way)
+        end, elapsed, course, rate = carrier.find(start, horizon, earliest, line, either_way=either_way)
         (there,) = _beliefs(belief, course, torch.tensor([[elapsed]], dtype=torch.float64))
-        gradient, rate = carrier.slopes(course.mean[-1, 0], line)
-        return Found(end, there, gradient, rate)
+        return Found(end, there, carrier.gradient(course.mean[-1, 0], line), rate)
 
     def _carrier(self, belief: Belief) -> Carrier:
         return Carrier(belief.model, belief.mean.detach().numpy(), self.surfaces, density_of(self.noise))
@@ -202,12 +201,11 @@ class Propagator:
             mean, covariance = map(torch.from_numpy, before)
             touched, height = self._touch(model, mean, covariance, float(h[r, k - 1]))
             course.mean[k, r], course.covariance[k, r] = touched
-            if hard[r] == BOUNCES:
-                course.level[k, r], course.age[k, r] = height, 0.0 if np.isfinite(height) else np.nan
+            course.level[k, r], course.age[k, r] = height, 0.0 if np.isfinite(height) else np.nan
         return course.at(slice(1, None))
 
     def _touch(self, model: BallModel, mean: Tensor, covariance: Tensor, h: float) -> tuple[tuple[Array, Array], float]:
-        """Mean and covariance after a step of h s of a ball (1, d) that reaches a surface's level, or rests.
+        """Mean and covariance after a step of h s of a ball (1, d) that reaches a surface's level.
 
         It also returns the height (m) of the surface of a single bounce, else NaN.
         """

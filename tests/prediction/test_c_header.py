@@ -149,6 +149,13 @@ def test_contacts(in_c: InC) -> None:
             close(jacobians[i], by_state[0])
 
 
+def on_table(model: BallModel) -> torch.Tensor:
+    """(1, 9) a ball that rolls."""
+    state = torch.tensor([[0, 0, model.radius, 0.5, 0.1, 0, 0, 20, 0]], dtype=torch.float64)
+    state[0, 2] += float(torch.as_tensor(model.surface_offset(state[0])).detach())
+    return state
+
+
 def test_predictions(in_c: InC) -> None:
     propagator, whole = Propagator(SURFACES, NOISE), 0
     for state, covariance in shots(60):
@@ -159,6 +166,12 @@ def test_predictions(in_c: InC) -> None:
         close(spreads, right.covariances[0, :done])
         whole += done == len(TIMES)
     assert whole > 40  # others bounce at an edge of the table
+    belief = Belief(in_c.model, torch.zeros(1).double(), on_table(in_c.model), torch.tensor(covariance[None]))
+    right = propagator.rollout(belief, TIMES)
+    done, means, spreads = in_c.predict(belief.mean[0].numpy(), covariance, TIMES)
+    assert done == len(TIMES)
+    close(means, right.states[0])
+    close(spreads, right.covariances[0])
 
 
 @pytest.mark.parametrize(("way", "direction"), [(1, "up"), (-1, "down"), (0, "either")])
@@ -186,9 +199,9 @@ def test_what_cannot_be_answered_is_said(in_c: InC) -> None:
     assert in_c.predict(state, covariance, np.array([np.nan]))[0] == 0
     assert in_c.cross(state, covariance, np.zeros(3), 1.0, 0)[0] == -1
     assert in_c.cross(state, covariance, np.array([1.0, 0.0, 0.0]), np.nan, 0)[0] == -1
-    rest = np.zeros(9)
-    rest[2] = in_c.model.radius + float(torch.as_tensor(in_c.model.surface_offset(torch.zeros(9).double())).detach())
-    assert in_c.predict(rest, covariance, TIMES)[0] == 0
+    rest = on_table(in_c.model)[0].numpy()
+    rest[5] = -0.04
+    assert in_c.predict(rest, covariance, TIMES)[0] == 0  # it lands
     outs = np.empty((1, 9)), np.empty((1, 9, 9))
     assert in_c("flights", 1, state[None].copy(), np.array([np.inf]), *outs) == 0
     assert in_c("contacts", 1, state[None].copy(), 0.0, float("nan"), np.empty(1), *outs) == 0

@@ -105,18 +105,28 @@ function_at: Final[Any] = intrinsic(_at_address)
 """The function of a model at an address, for machine code."""
 
 
-def built(source: str) -> Code:
-    """The compiled `compute` of some source."""
+def built(source: str, calls: Mapping[str, str] | None = None) -> Code:
+    """The compiled `compute` of some source, which may call others, whose sources were built before."""
+    return _built(_text(source, calls or {}))
+
+
+def _text(source: str, calls: Mapping[str, str]) -> str:
     called, imports = [helper for helper in HELPERS if f"{helper}(" in source], ""
     if called:  # the hash of their file: code that was compiled with another one is not found
         file = Path(__file__).with_name("layers.py")
         imports = f"from ballfg.dynamics.compiled.layers import {', '.join(called)}  # {digest(file)}\n"
-    return _built(HEADER.format(imports=imports) + source)
+    others = (f"from {_name(_text(other, {}))} import compute as {name}\n" for name, other in calls.items())
+    return HEADER.format(imports=imports + "".join(others)) + source
+
+
+def _name(text: str) -> str:
+    """The module of a generated file."""
+    return f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
 
 
 @cache
 def _built(text: str) -> Code:
-    name = f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
+    name = _name(text)
     found = [path for path in readable(f"{name}.py") if _holds(path, text)]
     path = found[0] if found else keep(f"{name}.py", text)
     module = sys.modules[name] = ModuleType(name)  # Python's own cache, if damaged, would be an error at each start

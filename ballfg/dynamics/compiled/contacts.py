@@ -51,7 +51,7 @@ def _approach(rates, surface, x, height, radius):
 
 
 @machine_code(COUNT(ONE))
-def _common_steps(durations):
+def common_steps(durations):
     """The number of steps for the longest of some durations; NaN needs none."""
     longest = 0.0
     for duration in durations:
@@ -72,7 +72,7 @@ def _search(rates, surface, state, heights, radius, longest, tau):
         lost[r] = math.isnan(tau[r])
         tau[r] = 0.0 if lost[r] else tau[r]
     for _ in range(limits.SEARCH_STEPS):
-        steps, searching = _common_steps(tau), False
+        steps, searching = common_steps(tau), False
         for r in range(m):
             put(at, state[r])
             if tau[r] != 0.0:
@@ -159,7 +159,7 @@ def meet(laws, start, startt, heights, longest, radius, tau, taut, after, aftert
     by_time = np.zeros(d + 1)  # the last direction is that of the contact's time
     by_time[d] = 1.0
     times_of(rates, surface, start, heights, longest, radius, tau)
-    steps = _common_steps(tau)
+    steps = common_steps(tau)
     for r in range(len(start)):
         found = tau[r]
         if math.isnan(found):
@@ -242,7 +242,7 @@ def travel(
             for q in range(d):
                 earlier[r, q] -= taut[r, q]
         x, xt, y, yt = y, yt, x, xt
-    fly_together(rates, x, xt, c, ct, w, left, earlier, _common_steps(left))
+    fly_together(rates, x, xt, c, ct, w, left, earlier, common_steps(left))
     for r in range(m):
         for i in range(wide):
             after[r, i] = x[r, i] if i < 9 else start[r, i]

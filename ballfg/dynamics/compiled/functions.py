@@ -1,11 +1,12 @@
-"""Compiles the functions of a ball model, rates, impact and surface, each with its tangents."""
+"""Compiles the functions of a ball model, rates, impact, surface and rolling, each with its tangents."""
 
+import inspect
 import sys
 import threading
 import warnings
 import weakref
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Final
@@ -30,6 +31,7 @@ from ballfg.state import STATE_DIM
 
 VALUES_AGREE: Final = 1e-12  # Largest relative difference between a compiled value and torch's
 SLOPES_AGREE: Final = 1e-10  # Largest relative difference between a compiled derivative and torch's
+VERSIONS: Final = f"torch {torch.__version__}, numba {numba.__version__}"
 COMPARED: Final = 4  # Number of random states at which both are computed
 
 
@@ -44,6 +46,7 @@ class Function:
     size: int  # m
     weigh: Recipe | None = None  # computes the weights from a model's tables; None if there are none
     source: str = ""  # of `compute`; empty where torch computes
+    calls: Mapping[str, str] = field(default_factory=dict)  # sources of the functions that it calls, by their names
 
 
 @dataclass(frozen=True)
@@ -53,40 +56,41 @@ class CompiledModel:
     rates: Function  # of the velocity, then of the spin, (6,)
     impact: Function  # state after an impact, (9,)
     surface: Function  # offset of surfaces above their declared heights in m, and their slopes along x and y, (3,)
+    rolling: Function  # rates of a ball that rests on a surface, (6,)
     radius: float  # m, of the ball
 
     @cached_property
-    def parts(self) -> tuple[Function, Function, Function]:
-        """Rates, impact and surface."""
-        return self.rates, self.impact, self.surface
+    def parts(self) -> tuple[Function, Function, Function, Function]:
+        """Rates, impact, surface and rolling."""
+        return self.rates, self.impact, self.surface, self.rolling
 
     @cached_property
-    def addresses(self) -> tuple[int, int, int]:
+    def addresses(self) -> tuple[int, ...]:
         """By which machine code takes them."""
-        return self.rates.compute.address, self.impact.compute.address, self.surface.compute.address
+        return tuple(part.compute.address for part in self.parts)
 
     @cached_property
     def _weighed(self) -> bool:
         """True if any of them has weights."""
         return any(part.weigh is not None for part in self.parts)
 
-    def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
-        """Weights of rates, impact and surface from a model's present tables."""
+    def weights(self, model: BallModel) -> tuple[Array, ...]:
+        """Weights of the `parts` from a model's present tables."""
         if not self._weighed:
-            return NONE, NONE, NONE
+            return (NONE,) * len(self.parts)
         tables = numbers_of(model).tables()
         now, known = stamp_of(tables), _weights.get(model)
         if known is None or known[0] != now:
             plain = [table.detach() for table in tables]
-            rates, impact, surface = (NONE if p.weigh is None else p.weigh(*plain).numpy() for p in self.parts)
-            known = _weights[model] = (now, tables, (rates, impact, surface))
+            found = tuple(NONE if p.weigh is None else p.weigh(*plain).numpy() for p in self.parts)
+            known = _weights[model] = (now, tables, found)
         return known[2]
 
 
 NONE: Final = np.zeros(0)  # The weights of a function without tables
-_Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, Array, Array]]
+_Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, ...]]
 """Stamp of a model's tables; these, kept so that no others get their place in memory and with it their stamp; the
-weights of rates, impact and surface that were computed from them."""
+weights of its functions that were computed from them."""
 _weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """Attributes of every module; its parameters, buffers and parts are compared by themselves."""
@@ -162,8 +166,8 @@ def _plain(value: object) -> Hashable:
 def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
         with doing("machine code for this model"):
-            rates, impact, surface = (_function(model, part, key) for part in PARTS)
-            made = CompiledModel(rates, impact, surface, model.radius)
+            rates, impact, surface = (_function(model, part, key) for part in PARTS[:-1])
+            made = CompiledModel(rates, impact, surface, _on_ground(model, rates), model.radius)
             _compare_steps_once(model, made, key)
         return made
     except ImportError:
@@ -174,7 +178,14 @@ def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
 
 
 def _rates(model: BallModel, state: Tensor) -> Tensor:
-    acceleration, spin_rate = model.rates(state)
+    return _together(*model.rates(state))
+
+
+def _rolling(model: BallModel, state: Tensor) -> Tensor:
+    return _together(*model.roll(state))
+
+
+def _together(acceleration: Tensor, spin_rate: Tensor | None) -> Tensor:
     return torch.cat((acceleration, torch.zeros_like(acceleration) if spin_rate is None else spin_rate), dim=-1)
 
 
@@ -190,7 +201,14 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
     return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
 
 
-PARTS: Final = (_rates, _impact, _surface)  # The functions that are compiled: of a model and of a state (9,)
+ON_GROUND: Final = """\
+def compute(x, c, w, xt, ct, y, yt):
+    air, airt = np.empty((len(x), 6)), np.empty((len(x), 6, xt.shape[2]))
+    rates(x, c, w, xt, ct, air, airt)
+    ground(x, air, w, xt, airt, y, yt)
+"""
+"""Source of rolling."""
+PARTS: Final = (_rates, _impact, _surface, _rolling)  # Functions of a model and of a state (9,)
 
 
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:
@@ -219,11 +237,34 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
     return made
 
 
+def _on_ground(model: BallModel, rates: Function) -> Function:
+    """Rolling: the rates in flight, then what the ground makes of them, so that a network is compiled once."""
+    own = type(model).on_ground is BallModel.on_ground
+    about = f"{model.radius!r}, {model.inertia_factor!r}, {source_stamp(inspect.getfile(BallModel))}, {_generator()}"
+    known = f"ground, {about}, {VERSIONS}"
+    kept = read_note(known) if own else None
+    if kept is None:
+        from ballfg.dynamics.compiled.translation.source import function_source
+        from ballfg.dynamics.compiled.translation.trace import trace
+
+        traced = trace(lambda x, air: _together(*model.on_ground(x, air[:3], air[3:])), [STATE_DIM, rates.size], [])
+        source = function_source(traced, *traced.inputs)
+        if own:
+            write_note(known, {"source": source})
+    else:
+        source = kept["source"]
+    built(source)
+    calls = {"rates": rates.source, "ground": source}
+    made = Function(built(ON_GROUND, calls), rates.names, rates.size, rates.weigh, ON_GROUND, calls)
+    if kept is None or not _is_of_package(model):
+        _compare(model, _rolling, made)
+    return made
+
+
 def _about(name: str, model: BallModel, key: Hashable | None) -> str | None:
     """The key of a note on a model of some structure; None if its parts have no files or cannot be compared."""
     files = None if key is None else _files_of(model)
-    versions = f"torch {torch.__version__}, numba {numba.__version__}"
-    return None if files is None else f"{name}, {key}, {files}, {_generator()}, {versions}"
+    return None if files is None else f"{name}, {key}, {files}, {_generator()}, {VERSIONS}"
 
 
 @cache

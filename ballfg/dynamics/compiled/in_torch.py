@@ -17,13 +17,14 @@ from numba import njit, objmode, types
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.build import Code
-from ballfg.dynamics.compiled.functions import PARTS, CompiledModel, Function
+from ballfg.dynamics.compiled.functions import PARTS, CompiledModel, Function, compiled
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.signatures import ONE, THREE, TWO
 from ballfg.dynamics.model import BallModel, substitute
 
-SIZES: Final = (6, 9, 3)  # Number of outputs of rates, impact and surface
+SIZES: Final = (6, 9, 3, 6)  # Number of outputs of rates, impact, surface and rolling
 
 _asked: dict[int, Callable[[Tensor, Tensor], Tensor]] = {}
 
@@ -76,12 +77,11 @@ def _code() -> Code:
 class InTorch(CompiledModel):
     """The functions of a model in torch; their weights are the `numbers` that identify them."""
 
-    numbers: tuple[int, int, int]
+    numbers: tuple[int, ...]
 
-    def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
-        """The numbers of rates, impact and surface."""
-        rates, impact, surface = (np.array([float(number)]) for number in self.numbers)
-        return rates, impact, surface
+    def weights(self, model: BallModel) -> tuple[Array, ...]:
+        """The numbers of its parts."""
+        return tuple(np.array([float(number)]) for number in self.numbers)
 
 
 _made: weakref.WeakKeyDictionary[BallModel, InTorch] = weakref.WeakKeyDictionary()
@@ -92,13 +92,19 @@ def in_torch(model: BallModel) -> InTorch:
     """The functions of any model; each call costs about half a millisecond."""
     if model not in _made:
         names, known = tuple(numbers_of(model).scalars), weakref.ref(model)
-        numbers = (next(_next), next(_next), next(_next))
+        numbers = tuple(next(_next) for _ in PARTS)
         for number, part in zip(numbers, PARTS, strict=True):
             _asked[number] = partial(_value, known, part, names)
             weakref.finalize(model, _asked.pop, number)
-        rates, impact, surface = (Function(_code(), names, size) for size in SIZES)
-        _made[model] = InTorch(rates, impact, surface, model.radius, numbers)
+        rates, impact, surface, rolling = (Function(_code(), names, size) for size in SIZES)
+        _made[model] = InTorch(rates, impact, surface, rolling, model.radius, numbers)
     return _made[model]
+
+
+def functions_for(model: BallModel) -> CompiledModel:
+    """The functions of a model, whose coefficients may travel: machine code where there is any, else torch."""
+    inner = model.model if isinstance(model, AugmentedModel) else model
+    return compiled(inner) or in_torch(inner)
 
 
 def _value(

@@ -2,6 +2,7 @@
 
 import weakref
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,13 +12,15 @@ from ballfg.arrays import Array, Index
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.contacts import coefficients_of, contact_times, travel
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
+from ballfg.dynamics.compiled.ground import advance_one, roll_rows
 from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.limits import MAX_CONTACTS, steps_over
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
 
-RATES, IMPACT, SURFACE = range(3)  # The places of a model's functions in `CompiledModel.parts`
+RATES, IMPACT, SURFACE, ROLLING = range(4)  # The places of a model's functions in `CompiledModel.parts`
 
 
 class Moving:
@@ -31,7 +34,8 @@ class Moving:
     def __init__(self, model: BallModel, functions: CompiledModel, start: Tensor | Array, width: int) -> None:
         inner, names = (model.model, model.names) if isinstance(model, AugmentedModel) else (model, ())
         self.functions, self.start, self.width = functions, _plain(start), width
-        self.addresses, self.weights = functions.addresses, functions.weights(inner)
+        *self.addresses, self._rolling = functions.addresses
+        *self.weights, self._rolling_weights = functions.weights(inner)
         self._own, self._places = _present(inner, functions, names)
 
     def travel(self, dt: Array, levels: Array, start: Array | None = None) -> tuple[Array, Array, Array]:
@@ -44,7 +48,8 @@ class Moving:
         """
         start = self.start if start is None else start
         after, moved, times = np.empty_like(start), np.empty((*start.shape, self.width)), np.empty_like(levels)
-        given = (*self.addresses, *self._own, *self._places, *self.weights, start, dt, levels)
+        own, places = self._own[:ROLLING], self._places[:ROLLING]
+        given = (*self.addresses, *own, *places, *self.weights, start, dt, levels)
         if not travel(*given, self.functions.radius, after, moved, times):
             raise ValueError("dt must be finite; got inf. Check the times.")
         return after, moved, times
@@ -89,17 +94,49 @@ class Moving:
     def _value(self, part: int, states: Array | None = None) -> tuple[Array, Array]:
         """(n, m) of a function at the start, or at other states of the balls, and its derivatives (n, m, d)."""
         n, d, function = len(self.start), self.width, self.functions.parts[part]
-        at, moved = self.start if states is None else states, np.zeros((n, STATE_DIM, d))
-        if d:
-            moved[:, range(STATE_DIM), range(STATE_DIM)] = 1.0
+        own, moved = self._states()
+        at = own if states is None else np.ascontiguousarray(states[:, :STATE_DIM])
         value, slopes = np.zeros((n, function.size)), np.zeros((n, function.size, d))
         c, ct = self.coefficients(part)
-        function.compute(np.ascontiguousarray(at[:, :STATE_DIM]), c, self.weights[part], moved, ct, value, slopes)
+        function.compute(at, c, self.weights[part], moved, ct, value, slopes)
         return value, slopes
 
     def all_coefficients(self) -> list[Array]:
         """`coefficients` of rates, impact and surface, one behind another."""
         return [array for part in (RATES, IMPACT, SURFACE) for array in self.coefficients(part)]
+
+    @property
+    def laws(self) -> tuple[Any, ...]:
+        """All laws of the balls for machine code: `signatures.GIVEN`, then `ROLLING`."""
+        rolling = (self._rolling, *self.coefficients(ROLLING), self._rolling_weights)
+        return (*self.addresses, *self.all_coefficients(), *self.weights, *rolling)
+
+    def roll(self, dt: Array, level: Array) -> tuple[Array, Array]:
+        """Where the balls are after rolling dt (n,) s at heights (n,) m, and the derivatives, as `travel` has them."""
+        x, moved = self._states()
+        roll_rows(*self.laws, dt, level, self.functions.radius, x, moved)
+        return self._whole(x, moved)
+
+    def advance(self, dt: float, world: Array) -> tuple[Array, Array, Array]:
+        """Where one ball is after dt s, the derivatives, and time (s) and height (m) of each bounce (k, 2) it made."""
+        (x, moved), steps = self._states(), steps_over(dt)
+        met = np.empty((2, steps * MAX_CONTACTS))
+        count = advance_one(*self.laws, dt / steps, steps, world, x[0], moved[0], *met)
+        return *self._whole(x, moved), met[:, :count].T
+
+    def _states(self) -> tuple[Array, Array]:
+        """Copies of the states (n, 9) without coefficients, and their derivatives (n, 9, d)."""
+        moved = np.zeros((len(self.start), STATE_DIM, self.width))
+        if self.width:
+            moved[:, range(STATE_DIM), range(STATE_DIM)] = 1.0
+        return self.start[:, :STATE_DIM].copy(), moved
+
+    def _whole(self, x: Array, moved: Array) -> tuple[Array, Array]:
+        """States (n, 9) and derivatives (n, 9, d) with the coefficients, which stay."""
+        after, jacobian = self.start.copy(), np.zeros((*self.start.shape, self.width))
+        after[:, :STATE_DIM], jacobian[:, :STATE_DIM] = x, moved
+        jacobian[:, range(STATE_DIM, self.width), range(STATE_DIM, self.width)] = 1.0
+        return after, jacobian
 
     def coefficients(self, part: int) -> tuple[Array, Array]:
         """(n, p) coefficients of a function for each ball, and their tangents (n, p, d)."""
@@ -183,23 +220,35 @@ def contact_time(
     return torch.from_numpy(moving.meets(*(_numbers(given, shape) for given in (height, longest)))).reshape(shape)
 
 
-def roll_out(
-    model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces
-) -> tuple[Tensor, Tensor]:
-    """Durations (n, k) s one after another, as in `rollout.rollout`: states (n, k, 9) and how many are valid (n,).
+def roll(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
+    """As `rollout.roll`, without derivatives."""
+    shape = np.broadcast_shapes(state.shape[:-1], dt.shape)
+    rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
+    durations, levels = (_numbers(given, torch.Size(shape)) for given in (dt, height))
+    after, _ = Moving(model, functions, rows, 0).roll(durations, levels)
+    return torch.from_numpy(after).reshape(*shape, state.shape[-1])
 
-    A ball that rests, or may come to rest, stays where that duration began.
-    """
+
+def roll_jacobian(
+    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, height: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """As `rollout.roll_jacobian`."""
+    moving = Moving(model, functions, state, state.shape[-1])
+    after, jacobian = moving.roll(_plain(dt), _numbers(height, dt.shape))
+    return torch.from_numpy(after), torch.from_numpy(jacobian)
+
+
+def roll_out(model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor:
+    """Durations (n, k) s one after another, as in `rollout.rollout`: states (n, k, 9)."""
     n, width = state.shape
     moving = Moving(model, functions, state, 0)
-    states, reached = np.empty((n, steps.shape[1], STATE_DIM)), np.empty(n, dtype=np.int64)
+    states = np.empty((n, steps.shape[1], STATE_DIM))
     durations, world = np.ascontiguousarray(steps.detach().numpy()), world_of(surfaces, functions.radius)
-    given = (*moving.addresses, *moving.all_coefficients(), *moving.weights)
-    roll_out_rows(*given, np.ascontiguousarray(moving.start[:, :STATE_DIM]), durations, world, states, reached)
+    roll_out_rows(*moving.laws, np.ascontiguousarray(moving.start[:, :STATE_DIM]), durations, world, states)
     if width > STATE_DIM:
         travelling = np.broadcast_to(moving.start[:, None, STATE_DIM:], (n, steps.shape[1], width - STATE_DIM))
         states = np.concatenate((states, travelling), axis=2)
-    return torch.from_numpy(states), torch.from_numpy(reached)
+    return torch.from_numpy(states)
 
 
 def world_of(surfaces: Surfaces, radius: float) -> Array:

@@ -42,6 +42,8 @@ ADDRESS: Final[Any] = types.int64
 """Where a `FUNCTION` lies: numba takes 6 us to see what a function is that Python passes."""
 GIVEN: Final = (*[ADDRESS] * 3, *[TWO, THREE] * 3, *[ONE] * 3)
 """`Laws` as Python passes them, since numba is slow to see what a tuple is: functions, coefficients, weights."""
+ROLLING: Final = (ADDRESS, TWO, THREE, ONE)
+"""The law of a ball that rests on a surface, as Python passes it."""
 
 
 def several(kind: Any, count: int) -> Any:

@@ -22,7 +22,7 @@ from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.flight_step import rk4_step
-from ballfg.dynamics.motion.integrate import fly, followed
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly, followed, is_plain
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED, step_count
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ, Z
@@ -43,12 +43,21 @@ def place_on(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
 
 def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
     """The state after `dt` (...) s on the surface at `height` m: sliding until it rolls, then rolling."""
+    if not followed(state, dt, height) and (functions := motion.functions_of(model)) is not None:
+        return motion.roll(model, functions, state, dt, height)
     state = place_on(model, state, height)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
     for _ in range(steps):
         state = rk4_step(model.roll, state, h)
     return state
+
+
+def roll_jacobian(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
+    """`roll` of states (n, 9) over dt (n,) s, and its derivative (n, 9, 9) by the state; both detached."""
+    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
+        return motion.roll_jacobian(model, functions, state, dt, height)
+    return batch_jacobian(lambda at: roll(model, at, dt, height), state)
 
 
 def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> Tensor:
@@ -165,18 +174,8 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
 
 
 def _by_machine_code(model: BallModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor | None:
-    """The states (n, k, 9) after each of the durations (n, k) s; None if torch must compute them.
-
-    Torch continues the balls that come to rest.
-    """
+    """The states (n, k, 9) after each of the durations (n, k) s; None if torch must compute them."""
     if not steps.numel() or followed(state, steps):
         return None
     functions = motion.functions_of(model)
-    if functions is None:
-        return None
-    states, reached = motion.roll_out(model, functions, state, steps, surfaces)
-    for k in range(int(reached.min()), steps.shape[1]):
-        rows = reached <= k
-        before = states[rows, k - 1] if k else state[rows]
-        states[rows, k] = _advance(take_rows(model, rows, len(state)), before, steps[rows, k], surfaces)
-    return states
+    return None if functions is None else motion.roll_out(model, functions, state, steps, surfaces)

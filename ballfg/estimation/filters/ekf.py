@@ -5,6 +5,7 @@ docs/estimators_ekf.md has the equations, the rules at contacts, hits and outlie
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -22,11 +23,12 @@ from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation.result import Contact, Quality
+from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement, measured_at
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, widened_near_contacts, with_contact_states
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
+from ballfg.estimation.smoother.second_look.low_hops import low_hops, uncounted_note, with_low_hops
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.linear.definite import raised
@@ -108,7 +110,15 @@ class ExtendedKalmanFilter(Estimator):
         if self.smooth:  # later samples show the side, except at the end
             estimate = widened_near_contacts(estimate, self.ball)
             found = {k: state for k, state in found.items() if k == len(track) - 1}
-        return with_contact_states(estimate, found).dated(written.times)
+        return self._doubted(track, run, with_contact_states(estimate, found)).dated(written.times)
+
+    def _doubted(self, track: Track, run: "_Run", estimate: Estimate) -> Estimate:
+        """An estimate whose covariances allow for all hops too low to tell from rest, as the smoother's do."""
+        hits = np.array(run.record.hits, dtype=np.int64)
+        events = replace(Segmentation.of_contacts((), len(track)), hits=hits)
+        hops = low_hops(track, events, self.model, self.surfaces, self.settings)
+        estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, track.times))
+        return with_low_hops(estimate, hops, self.model)
 
     def _result(
         self, track: Track, run: "_Run", mean: Array, covariance: Array, whitened: Array, status: Status | None = None

@@ -1,4 +1,4 @@
-"""Carries means and covariances of balls forward in machine code, through flight and plain bounces.
+"""Carries means and covariances of balls forward in machine code, through flight, plain bounces and rest.
 
 Within the uncertainty of a ball that bounces, some balls have not bounced yet. For a while, a second ball that flies on
 through the surface, *unbounced*, stands for them: `mixture.py` uses it.
@@ -9,8 +9,22 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs import edges
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import meet, times_of
-from ballfg.dynamics.compiled.flight import fly_one, glide, laws_of, laws_of_one, white_acceleration
-from ballfg.dynamics.compiled.signatures import COUNT, FLAG, FOUR, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.dynamics.compiled.flight import fly_one, glide, law_at, laws_of, laws_of_one, only, white_acceleration
+from ballfg.dynamics.compiled.ground import place_on
+from ballfg.dynamics.compiled.signatures import (
+    COUNT,
+    FLAG,
+    FOUR,
+    GIVEN,
+    LAW,
+    LAWS,
+    NOTHING,
+    ONE,
+    REAL,
+    ROLLING,
+    THREE,
+    TWO,
+)
 from ballfg.dynamics.motion.limits import BEYOND, NEGLIGIBLE, REST_SPEED
 
 
@@ -123,15 +137,30 @@ def fly_belief(rates, mean, covariance, h, noise, after, spread):
     add_flight(spread, h, noise)
 
 
-@machine_code(COUNT(*GIVEN, TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE))
+@machine_code(NOTHING(LAW, LAW, ONE, TWO, REAL, REAL, ONE, REAL, ONE, TWO))
+def roll_belief(surface, rolling, mean, covariance, h, level, noise, radius, after, spread):
+    """`fly_belief` at rest on the surface at a level (m)."""
+    d = len(mean)
+    jacobian = np.zeros((9, d))
+    for i in range(9):
+        jacobian[i, i] = 1.0
+    after[:] = mean
+    place_on(surface, after[:9], jacobian, level, radius)
+    fly_one(rolling, after[:9], jacobian, h, np.zeros(d), 1)
+    through(jacobian, covariance, spread)
+    add_flight(spread, h, noise)
+
+
+@machine_code(COUNT(*GIVEN, *ROLLING, TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE))
 def carry(
-    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws,
+    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, rolling, g, gt, wg,
     h, world, noise, mean, covariance, beside, besides, level, age, hard,
 ):  # fmt: skip
     """Carry n balls on by k steps of at most `MAX_STEP`, from the first row of each array to the next ones.
 
     Args:
-        c, b, s: coefficients of rates, impact and surface, (n, p) with tangents (n, p, d); w, wb, ws: their weights.
+        c, b, s, g: coefficients of rates, impact, surface and rolling, (n, p) with tangents (n, p, d); w, wb, ws, wg:
+            their weights.
         h (n, k): s, the steps.
         world (11,): m, heights of the table and of what lies below it (-inf: nothing), the ball's radius, the table's
             extent (x_low, x_high, y_low, y_high), the standard deviations of its ends.
@@ -139,10 +168,11 @@ def carry(
             vertical and along the surface (m/s), and of the spin (rad/s).
     Writes: mean (k + 1, n, d) and covariance (k + 1, n, d, d); for balls that fly on unbounced beside and besides, of
         the same shapes, the surface's level (k + 1, n) m and age (k + 1, n) s since then, NaN where there is none.
-    Returns: the number of steps done. Where that is less than k, hard (n,) tells which balls have not done the next
-        one: 1 if their bounce is not a plain one, 2 if they rest.
+    Returns: the number of steps done. Where that is less than k, hard (n,) is 1 for balls that have not done the next
+        one, since their bounce is not a plain one.
     """
     n, touch, all_laws = mean.shape[1], np.empty(9), laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
+    grounded = law_at(rolling, g, gt, wg)
     for k in range(h.shape[1]):
         stop = False
         for r in range(n):
@@ -155,8 +185,9 @@ def carry(
             else:
                 age[k + 1, r] = np.nan
             low, after = edges.level_below(laws.surface, x[:9], world), mean[k + 1, r]
-            if edges.at_rest(laws.surface, x[:9], low, world):
-                hard[r], stop = 2.0, True
+            if edges.stays(laws.rates, laws.surface, x[:9], low, world):
+                own, spread = only(grounded, r), covariance[k + 1, r]
+                roll_belief(laws.surface, own, x, covariance[k, r], step, low, noise, world[2], after, spread)
                 continue
             if after[5] >= 0.0 or edges.gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:
                 continue

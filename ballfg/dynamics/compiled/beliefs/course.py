@@ -2,25 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.beliefs.carry import carry
 from ballfg.dynamics.compiled.beliefs.events import find
 from ballfg.dynamics.compiled.beliefs.mixture import mix
-from ballfg.dynamics.compiled.functions import compiled
-from ballfg.dynamics.compiled.in_torch import in_torch, raise_errors
+from ballfg.dynamics.compiled.in_torch import functions_for, raise_errors
 from ballfg.dynamics.compiled.motion import Moving, world_of
+from ballfg.dynamics.compiled.signatures import GIVEN
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, Z
-
-BOUNCES: Final = 1.0  # A ball whose bounce is not plain
-RESTS: Final = 2.0  # A ball that lies on a surface
+from ballfg.state import STATE_DIM, Z
 
 
 @dataclass(frozen=True)
@@ -72,19 +68,19 @@ class Carrier:
     """
 
     def __init__(self, model: BallModel, mean: Array, surfaces: Surfaces, noise: Array) -> None:
-        inner = model.model if isinstance(model, AugmentedModel) else model
-        functions = compiled(inner) or in_torch(inner)
+        functions = functions_for(model)
         moving = Moving(model, functions, torch.from_numpy(mean), mean.shape[1])
-        self._given: tuple[Any, ...] = (*moving.addresses, *moving.all_coefficients(), *moving.weights)
+        self._laws = moving.laws
+        self._given = self._laws[: len(GIVEN)]
         self._functions = functions
         self._world, self._noise = world_of(surfaces, functions.radius), noise
-        self._keeps = inner  # what torch computes is found by the model as long as it is there
+        self._keeps = model  # what torch computes is found by the model as long as it is there
 
     def carry(self, course: Course, h: Array) -> tuple[Course, Array]:
         """Carry the last beliefs of a course on by steps of h (n, k) s of at most `MAX_STEP`.
 
-        Returns: the course from that time on, 1 + j times for j <= k steps; and hard (n,). A ball with a nonzero entry
-            has not reached the last time of the course: `BOUNCES` or `RESTS`; 0 for the others.
+        Returns: the course from that time on, 1 + j times for j <= k steps; and hard (n,): nonzero for a ball that has
+            not reached the last time of the course, since its bounce is not a plain one.
         """
         last, steps, n = course.at(slice(-1, None)), h.shape[1], h.shape[0]
         whole = Course(*(np.empty((steps + 1, *getattr(last, f.name).shape[1:])) for f in fields(Course)))
@@ -92,44 +88,43 @@ class Carrier:
             getattr(whole, field.name)[0] = getattr(last, field.name)[0]
         hard = np.zeros(n)
         arrays = [getattr(whole, field.name) for field in fields(Course)]
-        done = carry(*self._given, np.ascontiguousarray(h), self._world, self._noise, *arrays, hard)
+        done = carry(*self._laws, np.ascontiguousarray(h), self._world, self._noise, *arrays, hard)
         raise_errors()
         return whole.at(slice(done + 1 + bool(hard.any()))), hard
 
     def find(
         self, course: Course, horizon: float, earliest: float, line: tuple[Array, float] | None, *, either_way: bool
-    ) -> tuple[float, float, Course]:
+    ) -> tuple[float, float, Course, Array]:
         """Look for an event on the way of one ball from the last belief of a course on.
 
         Args:
             horizon, earliest: s from there; only events up to the one and after the other count.
             line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
             either_way: count a rise through the offset as well.
-        Returns: `events.NONE`, `FOUND` or `HARD`; the time (s) from there at which the search ended; the belief then.
+        Returns: `events.NONE`, `FOUND` or `HARD`; the time (s) from there at which the search ended; the belief then,
+            and after `FOUND` the mean's rate of change (9 + p,).
         """
         mean, covariance = course.mean[-1, 0].copy(), course.covariance[-1, 0].copy()
         normal, offset = (np.zeros(STATE_DIM), 0.0) if line is None else line
         how = (line is None, either_way, normal, offset, earliest, horizon)
-        end, time = find(*self._given, *how, self._world, self._noise, mean, covariance)
+        rate = np.zeros(len(mean))
+        end, time = find(*self._laws, *how, self._world, self._noise, mean, covariance, rate[:STATE_DIM])
         raise_errors()
-        return end, time, Course.start(mean[None], covariance[None])
+        return end, time, Course.start(mean[None], covariance[None]), rate
 
-    def slopes(self, mean: Array, line: tuple[Array, float] | None) -> tuple[Array, Array]:
-        """Gradient (9 + p,) of the event of `find` at a mean (9 + p,), and the mean's rate of change in flight."""
+    def gradient(self, mean: Array, line: tuple[Array, float] | None) -> Array:
+        """Gradient (9 + p,) of the event of `find` at a mean (9 + p,)."""
         width, x = len(mean), mean[None, :STATE_DIM].copy()
-        gradient, rate, moved = np.zeros(width), np.zeros(width), np.zeros((1, 3, width))
-        _, _, _, c, _, _, _, s, st, w, _, ws = self._given
-        rates, surface = self._functions.rates.compute, self._functions.surface.compute
+        gradient, moved = np.zeros(width), np.zeros((1, 3, width))
+        s, st, ws = (self._given[k] for k in (7, 8, 11))
         if line is None:
+            surface = self._functions.surface.compute
             surface(x, s[:1], ws, np.eye(STATE_DIM, width)[None], st[:1], np.empty((1, 3)), moved)
             gradient[Z] = 1.0
             gradient -= moved[0, 0]
         else:
             gradient[:STATE_DIM] = line[0]
-        change = np.empty((1, 6))
-        rates(x, c[:1], w, np.empty((1, STATE_DIM, 0)), np.empty((1, c.shape[1], 0)), change, np.empty((1, 6, 0)))
-        rate[POSITION], rate[VELOCITY], rate[SPIN] = mean[VELOCITY], change[0, :3], change[0, 3:]
-        return gradient, rate
+        return gradient
 
     def mixed(self, course: Course) -> Course:
         """The course with means and covariances of the balls on both sides of contacts of uncertain time."""

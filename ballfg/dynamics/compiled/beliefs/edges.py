@@ -46,13 +46,16 @@ def is_slow(x):
     return abs(x[5]) <= REST_SPEED / 2
 
 
-@machine_code(FLAG(LAW, ONE, REAL, ONE))
-def at_rest(surface, x, level, world):
-    """True if a state (9,) rests on the surface at a level (m)."""
-    if not is_slow(x):
+@machine_code(FLAG(LAW, LAW, ONE, REAL, ONE))
+def stays(rates, surface, x, level, world):
+    """True if a state (9,) rests on the surface at a level (m), and its weight keeps it there."""
+    if not is_slow(x) or (level == world[0] and not over_table(x, world)):
         return False
-    beside = level == world[0] and not over_table(x, world)
-    return abs(gap_of(surface, x, level, world[2])) <= REST_GAP and not beside
+    if not abs(gap_of(surface, x, level, world[2])) <= REST_GAP:
+        return False
+    change = np.empty(6)
+    value_of(rates, x, change)
+    return change[2] <= 0.0
 
 
 @machine_code(REAL(ONE, TWO, ONE))

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief
-from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, level_below, over_table
+from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief, roll_belief
+from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past, gap_of, level_below, over_table, stays
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import glide, laws_of, value_of
-from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, ONE, REAL, TWO, several
+from ballfg.dynamics.compiled.flight import fly_one, glide, law_at, laws_of, put, put_all, value_of
+from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, ROLLING, TWO, several
 from ballfg.dynamics.motion.limits import MAX_STEP
 
 LOOKS = 16  # Number of looks in a step of `MAX_STEP`: two crossings within 1.25 ms may pass unseen
@@ -16,28 +16,45 @@ NEWTON_STEPS = 20  # Largest number of steps to a crossing; three or four are en
 TIME_TOLERANCE = 1e-12  # s. Accuracy of the time of a crossing
 INSTANT = 1e-9  # s, within which a ball that has already touched a surface bounces
 NONE, FOUND, HARD = 0.0, 1.0, 2.0
-"""Ends of a search: nothing within the horizon; the event; a step other than flight or a plain bounce."""
+"""Ends of a search: nothing within the horizon; the event; a step other than flight, rest or a plain bounce."""
 
 
-@machine_code(several(REAL, 2)(LAW, ONE, ONE, REAL))
-def _value(rates, x, normal, offset):
-    """Normal . x - offset of a state (9,), and its time derivative."""
-    a, value, rate = np.empty(6), -offset, 0.0
-    value_of(rates, x, a)
+@machine_code(NOTHING(LAW, LAW, FLAG, ONE, ONE))
+def _rates_at(rates, rolling, resting, x, rate):
+    """The rate of change (9,) of a state (9,) in flight or at rest."""
+    if resting:
+        value_of(rolling, x, rate[3:])
+    else:
+        value_of(rates, x, rate[3:])
+    put(rate[:3], x[3:6])
+
+
+@machine_code(several(REAL, 2)(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, ONE))
+def _value(rates, rolling, resting, x, normal, offset, after, at):
+    """Normal . x - offset some s after a state (9,), and its time derivative.
+
+    Args: at (9,): working memory.
+    """
+    change, value, rate = np.empty(9), -offset, 0.0
+    put(at, x)
+    if resting:  # with tangents, though unused: exported C is shorter with one form
+        d = rolling.ct.shape[2]
+        fly_one(rolling, at, np.zeros((9, d)), after, np.zeros(d), 1)
+    else:
+        glide(rates, at, after, 1)
+    _rates_at(rates, rolling, resting, at, change)
     for i in range(9):
-        value += normal[i] * x[i]
-        rate += normal[i] * (x[3 + i] if i < 3 else a[i - 3])
+        value += normal[i] * at[i]
+        rate += normal[i] * change[i]
     return value, rate
 
 
-@machine_code(REAL(LAW, ONE, ONE, REAL, REAL, REAL))
-def _exact(rates, x, normal, offset, low, high):
-    """The time (s) between two others at which the value is zero in flight from x; NaN where Newton leaves them."""
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL))
+def _exact(rates, rolling, resting, x, normal, offset, low, high):
+    """The time (s) between two others at which the value is zero on the way from x; NaN where Newton leaves them."""
     at, tau, margin = np.empty(9), 0.5 * (low + high), 0.5 * (high - low)
     for _ in range(NEWTON_STEPS):
-        at[:] = x
-        glide(rates, at, tau, 1)
-        value, rate = _value(rates, at, normal, offset)
+        value, rate = _value(rates, rolling, resting, x, normal, offset, tau, at)
         move = -value / rate
         tau += move
         if not low - margin <= tau <= high + margin:
@@ -47,39 +64,38 @@ def _exact(rates, x, normal, offset, low, high):
     return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
 
 
-@machine_code(REAL(LAW, ONE, ONE, REAL, REAL, REAL, FLAG))
-def _zero(rates, x, normal, offset, h, earliest, either_way):
-    """The first time after `earliest` in h s of free flight at which the value goes through zero; NaN: it does not.
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, FLAG))
+def _zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
+    """The first time after `earliest` in h s, of free flight or of rest, at which the value goes through zero.
+
+    NaN: it does not, as where the normal is zero.
 
     Looks are at the cubic through the values and their rates at both ends, which is right to a micrometre.
     """
-    end = x.copy()
-    glide(rates, end, h, 1)
-    low, low_rate = _value(rates, x, normal, offset)
-    high, high_rate = _value(rates, end, normal, offset)
+    at = np.empty(9)
+    low, low_rate = _value(rates, rolling, resting, x, normal, offset, 0.0, at)
+    high, high_rate = _value(rates, rolling, resting, x, normal, offset, h, at)
     before = low
     for look in range(1, LOOKS + 1):
         t = look / LOOKS
         bend = (1.0 - t) * (low_rate * h - (high - low)) - t * (high_rate * h - (high - low))
         value = low + t * (high - low) + t * (1.0 - t) * bend
         if (before > 0.0 and value <= 0.0) or (either_way and before < 0.0 and value >= 0.0):
-            tau = _exact(rates, x, normal, offset, (look - 1) * h / LOOKS, look * h / LOOKS)
+            tau = _exact(rates, rolling, resting, x, normal, offset, (look - 1) * h / LOOKS, look * h / LOOKS)
             if tau > earliest:
                 return tau
         before = value
     return np.nan
 
 
-@machine_code(several(REAL, 3)(LAWS, ONE, REAL, ONE, ONE))
-def _contact_within(laws, x, h, world, touch):
+@machine_code(several(REAL, 3)(LAWS, REAL, ONE, REAL, ONE, ONE))
+def _contact_within(laws, low, x, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
 
-    It is unclear if the ball rests there, or falls past the table to the floor within the step. The third number is the
-    time at which it falls past the table, else NaN; writes its state there to touch (9,).
+    It is unclear if the ball falls past the table to the floor within the step. The third number is the time at which
+    it falls past the table, else NaN; writes its state there to touch (9,).
     """
-    low, after = level_below(laws.surface, x, world), x.copy()
-    if at_rest(laws.surface, x, low, world):
-        return low, np.nan, np.nan
+    after = x.copy()
     glide(laws.rates, after, h, 1)
     if after[5] >= 0.0 or gap_of(laws.surface, after, low, world[2]) >= 0.0:
         return np.nan, h, np.nan
@@ -91,36 +107,47 @@ def _contact_within(laws, x, h, world, touch):
     return low, tau, np.nan
 
 
-@machine_code(several(REAL, 2)(*GIVEN, FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO))
+@machine_code(several(REAL, 2)(*GIVEN, *ROLLING, FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO, ONE))
 def find(
-    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws,
-    contact, either_way, normal, offset, earliest, horizon, world, noise, mean, covariance,
+    rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, rolling, g, gt, wg,
+    contact, either_way, normal, offset, earliest, horizon, world, noise, mean, covariance, rate,
 ):  # fmt: skip
     """Carries one ball to an event, in place: its next contact, or the time when normal . x falls through an offset.
 
     Args:
-        c, b, s: coefficients of rates, impact and surface, (1, p) with tangents (1, p, d); w, wb, ws: their weights.
+        c, b, s, g: coefficients of rates, impact, surface and rolling, (1, p) with tangents (1, p, d); w, wb, ws, wg:
+            their weights.
         contact: look for the next contact.  either_way: count a rise through the offset too.  normal (9,).
         earliest, horizon: s from the start; only events after the one and up to the other count.
         world (11,), noise (5,): as `beliefs.carry`.
-    Writes: mean (d,) and covariance (d, d) at the event, or where the search ended.
+    Writes: mean (d,) and covariance (d, d) at the event, or where the search ended; the mean's rate of change there in
+        flight, or at rest, to rate (9,).
     Returns: `NONE`, `FOUND` or `HARD`, and the time (s) since the start.
     """
     d, passed, laws = len(mean), 0.0, laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     after, spread, x, touch = np.empty(d), np.empty((d, d)), mean[:9], np.empty(9)
+    grounded = law_at(rolling, g, gt, wg)
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
-        low, tau, past = _contact_within(laws, x, h, world, touch)
+        low, resting = level_below(laws.surface, x, world), False
+        if stays(laws.rates, laws.surface, x, low, world):
+            x[2] -= gap_of(laws.surface, x, low, world[2])
+            x[5] = 0.0
+            tau, past, resting = h, np.nan, True
+        else:
+            low, tau, past = _contact_within(laws, low, x, h, world, touch)
         touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
         h, event = INSTANT if touched else tau, np.nan
         if not touched:
-            if not contact:
-                event = _zero(laws.rates, x, normal, offset, h, earliest - passed, either_way)
-            elif math.isfinite(low) and passed + h > earliest:
+            event = _zero(laws.rates, grounded, resting, x, normal, offset, h, earliest - passed, either_way)
+            if contact and not resting and math.isfinite(low) and passed + h > earliest:
                 event = h
-        if math.isfinite(low) and not math.isfinite(event):
+        if resting:
+            h = event if math.isfinite(event) else h
+            roll_belief(laws.surface, grounded, mean, covariance, h, low, noise, world[2], after, spread)
+        elif math.isfinite(low) and not math.isfinite(event):
             if not bounce(laws, x, covariance, h, low, world, noise, after[:9], spread):
                 return HARD, passed
             after[9:] = mean[9:]
@@ -131,9 +158,10 @@ def find(
                 return HARD, passed
             if past <= h and not falls_past(laws, covariance, touch, past, h, world, after, spread):
                 return HARD, passed
-        mean[:] = after
-        covariance[:] = spread
+        put(mean, after)
+        put_all(covariance, spread)
         passed += h
         if math.isfinite(event):
+            _rates_at(laws.rates, grounded, resting, x, rate)
             return FOUND, passed
     return NONE, passed

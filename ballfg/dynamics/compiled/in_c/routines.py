@@ -35,11 +35,14 @@ class Routine:
         return cls(function.__name__.strip("_"), tree, function.__globals__, _changing(tree))
 
     @classmethod
-    def of_source(cls, name: str, source: str, known: Mapping[str, Any]) -> Self:
-        """Of the one function in a generated text, which computes a number anew in each loop that needs it."""
+    def of_source(cls, name: str, source: str, known: Mapping[str, Any], *, calls: bool = False) -> Self:
+        """Of the one function in a generated text, which computes a number anew in each loop that needs it.
+
+        Args: known: the names of its module.  calls: it does nothing but call others, with arrays of its own.
+        """
         (tree,) = ast.parse(source).body
         assert isinstance(tree, ast.FunctionDef)
-        return cls(name, tree, known, frozenset(), generated=True)
+        return cls(name, tree, known, frozenset(), generated=not calls)
 
     def returns(self) -> list[ast.Return]:
         """Its statements that return a value."""
