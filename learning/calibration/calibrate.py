@@ -268,7 +268,7 @@ def fitted_noise(
     """The noise of the fitted tracks about the calibrated model; None if undetermined.
 
     Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
-        errors: True to compute error bars, which doubles the time.
+        errors: True to compute error bars, which take several times as long.
     """
     if not model.measures_plainly or problem.dataset.rough:
         return None

@@ -107,7 +107,7 @@ def estimate_noise(
         tracker_known: True if the settings' memory of the tracker and jitter of the stamps are fixed.
         longest: s, used part of each track, from its first sample on. Errors of the model late in a track, after
             bounces, count as noise too.
-        errors: True to compute error bars, which doubles the time.
+        errors: True to compute error bars, which take several times as long.
         watch: called for each track and each step of the search.
         jobs: processes.
     Returns: None if no track is long enough.
