@@ -66,9 +66,7 @@ def _exact(rates, rolling, resting, x, normal, offset, low, high):
 
 @machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, FLAG))
 def _zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
-    """The first time after `earliest` in h s, of free flight or of rest, at which the value goes through zero.
-
-    NaN: it does not, as where the normal is zero.
+    """The first time after `earliest` in h s, of free flight or of rest, at which the value goes through zero, or NaN.
 
     Looks are at the cubic through the values and their rates at both ends, which is right to a micrometre.
     """
@@ -140,10 +138,10 @@ def find(
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
         h, event = INSTANT if touched else tau, np.nan
-        if not touched:
+        if not touched and not contact:
             event = _zero(laws.rates, grounded, resting, x, normal, offset, h, earliest - passed, either_way)
-            if contact and not resting and math.isfinite(low) and passed + h > earliest:
-                event = h
+        elif not touched and not resting and math.isfinite(low) and passed + h > earliest:
+            event = h
         if resting:
             h = event if math.isfinite(event) else h
             roll_belief(laws.surface, grounded, mean, covariance, h, low, noise, world[2], after, spread)
