@@ -109,7 +109,10 @@ class Found:
         refits, winner = self._attempted(attempts, tell)
         scored = retested(scored, refits)
         if not self.is_better(winner):
-            self.best = self.models[best.names] = replace(best, neighbours=screen.neighbours)
+            if self._refitted(best, screen):
+                tell("refits lead to a better fit of the effects that it began with")
+                self.rounds.append(Round(scored, refits))
+                return True
             if (exchanged := self._exchanged(screen, scored, tell)) is not None:
                 self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
                 return True
@@ -123,7 +126,7 @@ class Found:
         self.rounds.append(Round(scored, refits, names))
         if winner is None or not added:
             tell("nothing makes the model more probable")
-            return False
+            return self._refitted(best, screen)
         gone = [h.name for h in best.named if h not in winner.named]
         tell(" and ".join((*(f"{name} added" for name in names), *(f"{name} removed" for name in gone))))
         self.best = winner
@@ -132,6 +135,15 @@ class Found:
             self.best = again if self.is_better(again, winner) else winner
         self._pruned()
         return True
+
+    def _refitted(self, before: Weighed, screen: Screen) -> bool:
+        """Takes over the best fit of the best model's effects: refits without what they added may lead to a better one.
+
+        Returns: whether it is so much more probable that what else may be there is to be asked anew.
+        """
+        known = self.models[before.names]
+        self.best = self.models[before.names] = replace(known, neighbours=screen.neighbours)
+        return known.score > before.score - np.log(ALIKE)
 
     def _exchanged(self, screen: Screen, scored: Sequence[Scored], tell: Callable[[str], None]) -> Refit | None:
         """The refit with another effect in the place of one that makes the model more probable; None if none does.
