@@ -44,7 +44,9 @@ SAME_MOMENT: Final = 2e-4
 """s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at 20
 m/s^2 that is wrong by 0.4 um. States closer together would cost time without gain."""
 LEAST_SEEN: Final = 5  # Least number of sightings from one point: a flight has six unknowns, and noise must show
-LOOSE_DEPTH: Final = 0.5  # m, standard deviation of the depth from which the status of an estimate says so
+LOOSE_DEPTH, LOOSE_SHARE = 0.5, 0.1
+"""m, and share of the distance: standard deviation of the depth from which the status of an estimate says so. A share
+that is larger comes from a flight whose size only gravity shows, and is itself as uncertain."""
 
 
 class TooFewSightingsError(ValueError):
@@ -219,9 +221,10 @@ class CameraSightings(Observation):
         first = np.searchsorted(self.state, np.arange(len(estimate)))
         centres = np.stack([camera.centre for camera in self.cameras])[self.sightings.camera[first]]
         rays = estimate.states[:, POSITION] - centres
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        spread = np.einsum("ni,nij,nj->n", rays, estimate.covariances[:, POSITION, POSITION], rays)
-        loose = np.sqrt(np.median(spread)) > LOOSE_DEPTH
+        distance = np.linalg.norm(rays, axis=1)
+        rays /= distance[:, None]
+        sigma = np.sqrt(np.einsum("ni,nij,nj->n", rays, estimate.covariances[:, POSITION, POSITION], rays))
+        loose = np.median(sigma) > LOOSE_DEPTH or np.median(sigma / distance) > LOOSE_SHARE
         return replace(estimate, status=Status.DEPTH_UNCERTAIN) if loose else estimate
 
     def segmentation(self) -> Segmentation | None:

@@ -215,11 +215,12 @@ def test_a_turned_world_has_turned_states(ball: World) -> None:
         np.testing.assert_allclose(other.states[:, part], one.states[:, part] @ turn.T, rtol=1e-3, atol=2e-3)
 
 
-def test_open_depth_is_said_and_wide(ball: World) -> None:
+@pytest.mark.parametrize("camera", [SIDE, looking("near", (-0.5, -1.5, 1.6))], ids=lambda camera: str(camera.name))
+def test_open_depth_is_said_and_wide(ball: World, camera: Camera) -> None:
     """The flight before a bounce alone: the status says so, and the truth lies within the wide covariance."""
     times, states = stroke(ball, 1)
     surfaces = replace(ball.surfaces, extent=(-1.37, 1.37, -0.76, 0.76))
-    track = sighted_track("a", pixels_of(states[:, :3], times, SIDE, 2.0), [SIDE]).opening(0.2)
+    track = sighted_track("a", pixels_of(states[:, :3], times, camera, 2.0), [camera]).opening(0.2)
     found = Smoother(ball.model, surfaces).estimate(track)
     assert found.status is Status.DEPTH_UNCERTAIN
     error = found.states[:, :3] - states[: len(track), :3]
