@@ -237,12 +237,17 @@ def open_source(
     observed: float = math.inf,
     ball: str | None = None,
 ) -> Inputs[Any]:
-    """`open_inputs` or `open_sighted`; without a source the positions, where there is a table of them."""
+    """`open_inputs` or `open_sighted`."""
+    if is_sighted(source, dataset):
+        return open_sighted(dataset, model, effects_files, ball)
+    return open_inputs(dataset, model, effects_files, observed, ball)
+
+
+def is_sighted(source: Source | None, dataset: Path) -> bool:
+    """True for detections; without a source, where there is no table of positions but one of detections."""
     from ballfg.estimation.reading import has_positions
 
-    if has_positions(dataset) if source is None else source is Source.POSITIONS:
-        return open_inputs(dataset, model, effects_files, observed, ball)
-    return open_sighted(dataset, model, effects_files, ball)
+    return not has_positions(dataset) if source is None else source is Source.DETECTIONS
 
 
 def open_model(data: "Dataset | SightedDataset", model: Path | None, ball: str | None = None) -> "BallModel":

@@ -153,7 +153,8 @@ def _open_source(folder: Path) -> RowSource:
         if (folder / DETECTIONS_FILE).is_file():
             raise FileNotFoundError(
                 f"{folder} must hold {' or '.join(TRACK_FILES)}, positions, for this command; it holds sightings of "
-                "cameras alone. They serve 'ballfg estimate --from detections', and ballfg-train with kind: calibrate."
+                "cameras alone. They serve 'ballfg estimate --from detections', 'ballfg noise', and ballfg-train with "
+                "kind: calibrate."
             )
         problem = f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}"
         raise FileNotFoundError(f"{problem}. Add it: trajectory,t,x,y,z (docs/tracks.md).")

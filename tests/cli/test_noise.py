@@ -9,8 +9,12 @@ import pytest
 
 from ballfg.dynamics import load_model
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
-from ballfg.tracks import read_dataset
+from ballfg.tracks import TABLE_TENNIS, read_dataset
+from ballfg.tracks.info import DatasetInfo, write_info
+from ballfg.vision.camera_file import write_cameras
 from tests.commands import status
+from tests.estimation.observations.sighted_rig import RIG, TABLE, scene, world
+from tests.written_tables import write_sightings
 
 
 @pytest.fixture(scope="module")
@@ -45,3 +49,26 @@ def test_table_and_files(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 def test_bad_input(shots: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str) -> None:
     assert status("noise", *(word.replace("SHOTS", str(shots)) for word in words)) == 2
     assert message in capsys.readouterr().err
+
+
+def test_pixels_of_each_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a table of tracks no option is needed; neither a model file nor dataset.yaml could hold the noise."""
+    write_info(tmp_path / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
+    write_cameras(tmp_path / "cameras.yaml", RIG)
+    shots = [(name, scene(seed, world(), duration=0.3).sightings) for seed, name in enumerate(("one", "two"))]
+    write_sightings(tmp_path / "detections.csv", shots)
+    files = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert status("noise", tmp_path) == 0
+    said = capsys.readouterr().out
+    assert "noise of pixels from 2 tracks" in said
+    found = re.findall(
+        r"camera (\w+), (\d+) sightings\n +error .*axis +([\d.]+) x/: ([\d.]+)  px  \(stated 0.3\)", said
+    )
+    assert [name for name, *_ in found] == [camera.name for camera in RIG]
+    assert sum(int(count) for _, count, *_ in found) == sum(len(sightings) for _, sightings in shots)
+    assert all(0.2 < float(sigma) < 0.4 and float(factor) < 1.15 for *_, sigma, factor in found)
+    assert "streak" not in said
+    for words in (["--write"], ["--from", "detections", "--out", tmp_path / "model.yaml"]):
+        assert status("noise", tmp_path, *words) == 2
+        assert "--out and --write must be left out" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == files

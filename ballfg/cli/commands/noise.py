@@ -12,6 +12,7 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
     from ballfg.estimation.noise.estimate import NoiseEstimate
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
 MEANINGS = {
@@ -40,6 +41,9 @@ MOST = {
 }  # fmt: skip
 """Largest noise of a ball that is tracked, by the names of `MEANINGS`, in SI units."""
 
+STREAK = ("error of a sighting, along each axis", "in addition, along its streak")
+LEAST_STREAK = 0.01  # Share of a sighting's error below which it has no streak
+
 
 def noise(
     dataset: inputs.DatasetFolder,
@@ -52,8 +56,11 @@ def noise(
     ] = None,
     write: Annotated[bool, typer.Option("--write", help="Write the noise into the dataset's dataset.yaml.")] = False,
     anyway: inputs.Anyway = False,
+    source: inputs.SourceName = None,
 ) -> None:
     """The noise of the tracker, of flights, bounces, labels and spins that the tracks of a dataset show.
+
+    From detections it is the noise of each camera's pixels, beside the stated one.
 
     It is the noise with which forecasts 20 to 300 ms ahead, within the tracks, are most probable. The model stays as it
     is: an effect that it lacks counts as noise. `estimate` and `predict` do the same on fewer tracks where neither
@@ -66,6 +73,13 @@ def noise(
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
+    if inputs.is_sighted(source, dataset):
+        if out is not None or write:
+            raise ValueError(
+                "--out and --write must be left out for detections: models and dataset.yaml hold no pixels"
+            )
+        _of_pixels(inputs.open_sighted(dataset, model, effects_file), tracks)
+        return
     inputs.know_effects(effects_file)
     inputs.know_observations(observations_file)
     data = with_readings(read_dataset(dataset))
@@ -91,6 +105,24 @@ def noise(
         f"{100 * found.held_before:.0f} %"
     )
     _write(found, data, ball, out, write)
+
+
+def _of_pixels(given: "inputs.Inputs[SightedDataset]", most: int) -> None:
+    """Prints the noise of each camera's sightings."""
+    from ballfg.estimation import Settings, Smoother
+    from ballfg.estimation.noise.estimate import spread_over
+    from ballfg.estimation.noise.sightings import noise_of_sightings
+
+    data = given.dataset
+    chosen = spread_over(data, len(data), most)
+    smoother = Smoother(given.model, given.surfaces, Settings.for_measured(given.model))
+    print(f"{data.path}: noise of pixels from {len(chosen)} tracks")
+    for one in noise_of_sightings(smoother, chosen):
+        print(f"  camera {one.camera}, {one.count} sightings")
+        rows = zip(STREAK, one.sigmas, one.errors, one.stated, strict=True)
+        for name, sigma, error, stated in rows:
+            if stated > LEAST_STREAK * one.stated[0]:
+                print(f"    {name:50} {sigma:8.3g} x/: {math.exp(error):4.2f}  px  (stated {stated:.3g})")
 
 
 def check_known(found: "NoiseEstimate", dataset: Path) -> None:

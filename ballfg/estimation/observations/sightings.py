@@ -179,6 +179,12 @@ class CameraSightings(Observation):
         """The track with other sightings in place of these."""
         return replace(track, observations=tuple(other if one is self else one for one in track.observations))
 
+    def with_noise(self, track: Track, covariances: Array) -> Track:
+        """The track with other covariances (m, 2, 2) px^2 of its sightings, seen by exact cameras."""
+        noisy = replace(self.sightings, covariances=covariances)
+        exact = tuple(replace(camera, covariance=None) for camera in self.cameras)
+        return self._in_place(track, replace(self, sightings=noisy, cameras=exact))
+
     def loosened(self, track: Track) -> Track | None:
         """The track with the error of a start's laws added to the noise of one camera's pixels, if that is smaller."""
         if not self.one_view or self.known is not None:

@@ -9,13 +9,13 @@ import numpy as np
 from ballfg.arrays import Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.noise.sightings import Noise, settled
 from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
 from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, Field
 from ballfg.estimation.rally.joined import joined_estimates
 from ballfg.estimation.rally.moments import Event
-from ballfg.estimation.rally.noise import Noise, left_over
 from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
@@ -32,8 +32,6 @@ from ballfg.vision.detection.detections import Detections
 FRAME_SIGMA: Final = 0.3
 """px, of a picture's camera beside the error that all of a shot share."""
 
-NOISE_ROUNDS, NOISE_SETTLED = 8, 0.2
-"""Rounds in which the candidates' noise is found, and the change of its factors' logarithms that ends them."""
 KINK: Final = 2.0
 """px, standard deviation of the middle of a bar in which the ball bounced."""
 
@@ -152,21 +150,15 @@ def _noise(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen,
 
     An error of the camera moves a whole stroke: it hardly shows in what is left of single candidates.
     """
-    noise = Noise()
     if not chosen.strokes:
-        return noise
+        return Noise()
     rows = np.concatenate([stroke.rows for stroke in chosen.strokes])
-    stated, plain, loss = seen.covariances[rows], ~kinked[rows], smoother.settings.sighting_loss
-    for _ in range(NOISE_ROUNDS):
-        now = _with_noise(seen, noise, kinked)
-        tracks = [_track(stroke, now, camera, smoother.model, smoother.surfaces) for stroke in chosen.strokes]
-        found = [smoother.estimate(track) for track in tracks]
-        used = plain & np.repeat([not one.status.failed for one in found], [len(one) for one in found])
-        off, spread = left_over(tracks, found)
-        before, noise = noise, noise.likelier(stated[used], off[used], spread[used], loss)
-        if noise.changed(before) < NOISE_SETTLED:
-            break
-    return noise
+
+    def tracks_of(noises: list[Noise]) -> list[Track]:
+        now = _with_noise(seen, noises[0], kinked)
+        return [_track(stroke, now, camera, smoother.model, smoother.surfaces) for stroke in chosen.strokes]
+
+    return settled(smoother, tracks_of, seen.covariances[rows], np.zeros(len(rows), dtype=np.int64), ~kinked[rows])[0]
 
 
 def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, surfaces: Surfaces) -> Track:

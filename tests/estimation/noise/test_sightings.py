@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -9,9 +11,12 @@ from scipy.stats import multivariate_normal
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.cameras.strokes import MODEL
-from ballfg.estimation.rally.noise import KNOWN, Noise, parts
+from ballfg.estimation.noise.sightings import KNOWN, Noise, noise_of_sightings, parts
 from ballfg.estimation.rally.reconstruct import FRAME_SIGMA, reconstruct
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.loss import Loss
+from tests.estimation.observations.sighted_rig import NOISE as RIGS_NOISE, RIG, scene, track_of, world
 from tests.estimation.rally.planted import NOISE, SURFACES, planted
 
 COUNT, WIDE = 150, 10.0  # candidates; px, prior standard deviation of a parabola's terms
@@ -74,3 +79,19 @@ def test_the_noise_of_planted_candidates_is_found() -> None:
     sigma = np.sqrt(np.median(one.seen.covariances[rows, 0, 0]))
     assert sigma == pytest.approx(NOISE, rel=0.25)
     assert abs(sigma - NOISE) < 0.5 * (np.sqrt(stated) - NOISE)
+
+
+def test_each_camera_has_its_own_noise() -> None:
+    """Stated as 0.3 px, the left camera errs by that, the right one by twice as much, the back one by a half."""
+    ball, true, tracks = world(), np.array([1.0, 2.0, 0.5]) * RIGS_NOISE, []
+    for seed in range(5):
+        made = scene(seed, ball)
+        where = np.stack([RIG[c].project(x[:3]) for c, x in zip(made.sightings.camera, made.truth, strict=True)])
+        off = (made.sightings.pixels - where) * (true / RIGS_NOISE)[made.sightings.camera][:, None]
+        tracks.append(track_of(made._replace(sightings=replace(made.sightings, pixels=where + off))))
+    found = noise_of_sightings(Smoother(ball.model, ball.surfaces, Settings.for_measured(ball.model)), tracks)
+    assert [one.camera for one in found] == [camera.name for camera in RIG]
+    for one, sigma in zip(found, true, strict=True):
+        assert one.stated == pytest.approx((RIGS_NOISE, 0.0))
+        assert 0.0 < one.errors[0] < 0.03
+        assert abs(np.log(one.sigmas[0] / sigma)) < 3.0 * one.errors[0]
