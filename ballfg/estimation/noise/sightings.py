@@ -26,8 +26,6 @@ KNOWN: Final = 1.0
 ROUNDS, SETTLED, KNOWN_TO = 8, 0.2, 0.02
 """Rounds of estimates in which the noise is found, and the change of its factors' logarithms that ends them: where
 estimates need it, and where it is what is asked."""
-
-
 NODES, LARGEST, ROUNDING = 60, 10.0, 1e-9
 """Of the quadrature over normal errors; of the ratio that is solved for; of its equation."""
 

@@ -45,8 +45,8 @@ SAME_MOMENT: Final = 2e-4
 m/s^2 that is wrong by 0.4 um. States closer together would cost time without gain."""
 LEAST_SEEN: Final = 5  # Least number of sightings from one point: a flight has six unknowns, and noise must show
 LOOSE_DEPTH, LOOSE_SHARE = 0.5, 0.1
-"""m, and share of the distance: standard deviation of the depth from which the status of an estimate says so. A share
-that is larger comes from a flight whose size only gravity shows, and is itself as uncertain."""
+"""m, and share of the distance: standard deviation of the depth from which the status of an estimate says so. Where
+gravity alone shows how large a flight is, a fifth of the distance is open, near the camera too."""
 
 
 class TooFewSightingsError(ValueError):
