@@ -3,7 +3,7 @@
 import csv
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, BinaryIO
 
@@ -27,7 +27,7 @@ class TableWriter:
 
     Floats are written with enough digits to restore the same float64. Memory is bounded by a block. In CSV, a text that
     a spreadsheet would take for a formula (=, +, - or @ at its beginning, and no number) gets an apostrophe in front,
-    which ballfg's readers remove.
+    which ballfg's readers remove; not in columns `plain`, which hold words of a format, such as +x.
 
     Example:
         with TableWriter("states.csv") as table:
@@ -38,8 +38,8 @@ class TableWriter:
         folder of the path does not exist.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = check_path("path", path)
+    def __init__(self, path: str | os.PathLike[str], *, plain: Sequence[str] = ()) -> None:
+        self.path, self.plain = check_path("path", path), frozenset(plain)
         if self.path.suffix.lower() not in ENDINGS:
             raise ValueError(
                 f"path must end in {' or '.join(ENDINGS)}; got {str(path)!r}. Choose the format by the ending."
@@ -103,7 +103,7 @@ class TableWriter:
                 csv.writer(header, lineterminator="\n").writerow(map(guarded, table.column_names))
                 self._file.write(header.getvalue().encode())
             for place, field in enumerate(table.schema):
-                if pa.types.is_string(field.type):
+                if pa.types.is_string(field.type) and field.name not in self.plain:
                     text = table.column(place)  # formulas get quoted; see `ballfg.files.spreadsheet`
                     formula = pc.match_substring_regex(text, QUOTED)
                     risky = pc.and_(formula, pc.invert(pc.match_substring_regex(text, NUMBER)))

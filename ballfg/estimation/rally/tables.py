@@ -62,7 +62,7 @@ def write_rally(
             with TableWriter(stage / STATES) as states:
                 for estimate in (estimate for one in rallies for estimate in one.estimates):
                     states.write({KEY: estimate.name, **estimate.columns, **_correlations(estimate.covariances)})
-            with TableWriter(stage / STROKES) as table:
+            with TableWriter(stage / STROKES, plain=["end"]) as table:
                 table.write({name: np.array([row[name] for row in strokes]) for name in strokes[0]})
         return [name for name in FILES if (stage / name).is_file()]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import shutil
@@ -111,6 +112,8 @@ def test_what_is_written_is_a_dataset_that_other_commands_read(made: tuple[Truth
     assert {"rho_xy", "rho_xz", "rho_yz"} <= set(header)
     kinds = {line.split(",")[2] for line in (folder / "events.csv").read_text(encoding="utf-8").splitlines()[1:]}
     assert kinds <= {"hit", "bounce", "lost", "net", "floor", "cut"}
+    with (folder / "strokes.csv").open(encoding="utf-8", newline="") as file:
+        assert [row["end"] for row in csv.DictReader(file)] == [row["end"] for row in rally.strokes]
 
 
 def alone(folder: Path) -> list[Estimate]:
