@@ -73,15 +73,15 @@ def noise(
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
+    inputs.know_effects(effects_file)
+    inputs.know_observations(observations_file)
     if inputs.is_sighted(source, dataset):
         if out is not None or write:
             raise ValueError(
                 "--out and --write must be left out for detections: models and dataset.yaml hold no pixels"
             )
-        _of_pixels(inputs.open_sighted(dataset, model, effects_file), tracks)
+        _of_pixels(inputs.open_sighted(dataset, model), tracks)
         return
-    inputs.know_effects(effects_file)
-    inputs.know_observations(observations_file)
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
     data = inputs.flights_only(data, anyway)

@@ -56,14 +56,14 @@ class Noise:
         return max(abs(np.log(self.around / before.around)), abs(np.log(self.along / before.along)))
 
     def likelier(self, stated: Array, off: Array, spread: Array, loss: Loss) -> "Noise":
-        """The factors with which the candidates are likelier, if the flights were found with the factors of today.
+        """The factors with which the sightings are likelier, if the flights were found with the factors of today.
 
-        The distances have the covariance S - P, with that of the candidates S and that of the flights P: a part of S
+        The distances have the covariance S - P, with that of the sightings S and that of the flights P: a part of S
         grows as much as its share in the squares of the distances exceeds its share in S - P.
 
         Args:
-            stated: (n, 2, 2) px^2.  off: (n, 2) px, from the flights to the candidates.
-            spread: (n, 2, 2) px^2, P.  loss: of a candidate, which weighs far ones less.
+            stated: (n, 2, 2) px^2.  off: (n, 2) px, from the flights to the sightings.
+            spread: (n, 2, 2) px^2, P.  loss: of a sighting, which weighs far ones less.
         """
         inverse = np.linalg.inv(self.of(stated))
         white = (inverse @ off[..., None])[..., 0]
