@@ -225,24 +225,31 @@ def _scales(
     return ConformalScales.of(predicted(calibration, len(calibration)), calibration.info.name, observe, method)
 
 
-def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> "Diagnosis":
-    """The effects that the model of the ball lacks, found in measured tracks.
+def diagnose(measured: "Tracks | Folder", model: Model = None, *, jobs: int = 1) -> "Diagnosis":
+    """The effects that the model of the ball lacks, found in measured tracks, or in strokes that one camera saw.
 
     Args:
-        measured: a dataset or its folder; one half of the tracks finds effects, the other half judges them.
+        measured: a dataset or its folder; one half of the tracks finds effects, the other half judges them. Strokes of
+            one camera, which have no table of positions, are searched as a whole.
         model: the analytic model to diagnose, or its file; None: the nominal model of the ball; of a `Ball`, likewise.
         jobs: processes.
     Returns: the effects found, with their evidence, and the corrected model.
     Raises:
         TypeError: for another type in place of a dataset, or a model that is learned or no model.
-        ValueError: a dataset without a table of positions, too few tracks, or none with a flight that is long enough.
+        ValueError: detections of several cameras, too few tracks, or none with a flight that is long enough.
         FileNotFoundError: a folder or model file that is not there.
     """
     check_count("jobs", jobs, 1, MOST_JOBS)
-    data = _table_of_positions(measured)
     from ballfg.diagnosis import diagnose as diagnose_dataset  # half of the package, which estimates do not need
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.parallel.work import on_one_thread
 
+    data = _opened(measured) if isinstance(measured, str | PathLike) else measured
+    if isinstance(data, SightedDataset):
+        from ballfg.diagnosis.one_view.diagnosis import diagnose_one_view
+
+        return on_one_thread(partial(diagnose_one_view, data, jobs=jobs), _model(model, data))
+    data = _table_of_positions(data)
     # as in the commands: threads gain nothing on such small batches, and slow each other down
     return on_one_thread(partial(diagnose_dataset, _in_flight(data).dataset, jobs=jobs), _model(model, data))
 
@@ -274,7 +281,7 @@ def _table_of_positions(measured: object) -> Dataset:
 
     data = _opened(measured) if isinstance(measured, str | PathLike) else measured
     if isinstance(data, SightedDataset):
-        raise ValueError("measured must have a table of positions; a diagnosis of detections alone is not possible")
+        raise ValueError("measured must have a table of positions; got detections. Make tracks with 'ballfg track'.")
     if not isinstance(data, Dataset):
         what = "one Track; effects show in many of them" if isinstance(data, Track) else type_name(data)
         raise TypeError(

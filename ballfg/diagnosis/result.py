@@ -266,7 +266,9 @@ class Diagnosis:
         probabilities: that an effect is there, by name, over all models that were compared; the most probable first.
         nothing_lacking: probability that nothing is lacking, neither an effect of the catalogue nor something nameless.
         budget: parts of the prediction error; None for several datasets, or if the model sees a hit in each track.
-        nameless: probability that forces, kicks or position errors remain that no effect of the catalogue describes.
+        nameless: probability that forces, kicks or position errors remain that no effect of the catalogue describes;
+            NaN from one camera.
+        evaluation: how it was evaluated, in words; empty for the usual way, by the held-out half.
     """
 
     dataset: str
@@ -293,6 +295,7 @@ class Diagnosis:
     nameless: float = float("nan")
     budget: ErrorBudget | None = None
     unpopulated: Errors | None = None
+    evaluation: str = ""
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

@@ -24,6 +24,7 @@ def diagnose(
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
     name_at: Annotated[float, typer.Option(help="Probability from which on an effect is named.")] = NAME_AT,
+    source: inputs.SourceName = None,
     anyway: inputs.Anyway = False,
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
@@ -39,15 +40,20 @@ def diagnose(
     for programs (report.json), and the corrected model for the --model of other
     commands (model.yaml).
 
+    From the detections of one camera all strokes are searched, for what the
+    ball's laws lack and for errors of the camera's clock and lens.
+
     Several datasets are diagnosed together: the ball is the same, rooms and rigs
     are their own. model.yaml is then the ball's, for a room that had no part, and
     model.NAME.yaml that of each room.
     """
     from ballfg.checks import check_range
     from ballfg.diagnosis import diagnose as find, diagnose_jointly
+    from ballfg.diagnosis.one_view.diagnosis import diagnose_one_view
     from ballfg.diagnosis.report.origin import Origin
     from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, room_file, write_report
     from ballfg.dynamics import AnalyticModel
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.files.whole_folder import reserved
 
     check_range("--name-at", name_at, 0.0, 1.0)
@@ -58,7 +64,12 @@ def diagnose(
     with reserved(out):  # until the report is written: a diagnosis takes minutes
         check_report_folder(out, force=force)
         inputs.know_observations(observations_file)
-        opened, *others = [inputs.open_inputs(dataset, model, effects_file).in_flight(anyway) for dataset in datasets]
+        opened, *others = [
+            inputs.open_source(source, dataset, model, effects_file).in_flight(anyway) for dataset in datasets
+        ]
+        sighted = [isinstance(one.dataset, SightedDataset) for one in (opened, *others)]
+        if others and any(sighted):
+            raise ValueError("several datasets must have positions; got detections. Diagnose each camera's alone.")
         if not isinstance(opened.model, AnalyticModel):
             raise ValueError(
                 f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "
@@ -70,9 +81,13 @@ def diagnose(
                 together = [opened.dataset, *(other.dataset for other in others)]
                 joint = diagnose_jointly(together, opened.model, jobs=processes, watch=announce, name_at=name_at)
                 diagnosis, rooms = joint.whole, joint.rooms
+            elif sighted[0]:
+                diagnosis = diagnose_one_view(
+                    opened.dataset, opened.model, jobs=processes, watch=announce, name_at=name_at
+                )
             else:
                 diagnosis = find(opened.dataset, opened.model, jobs=processes, watch=announce, name_at=name_at)
-        typed = _typed(datasets, model, effects_file, observations_file, name_at, out)
+        typed = _typed(datasets, model, effects_file, observations_file, name_at, source, out)
         models = tuple(map(room_file, rooms)) or (MODEL,)
         origin = Origin(
             typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models, opened.doubts
@@ -91,6 +106,7 @@ def _typed(
     effects: Sequence[Path] | None,
     observations: Sequence[Path] | None,
     name_at: float,
+    source: inputs.Source | None,
     out: Path,
 ) -> str:
     """The command line, without options that do not change the result."""
@@ -99,6 +115,7 @@ def _typed(
     words += [word for path in effects or () for word in ("--effects-file", str(path))]
     words += [word for path in observations or () for word in ("--observations-file", str(path))]
     words += [] if name_at == NAME_AT else ["--name-at", f"{name_at:g}"]
+    words += [] if source is None else ["--from", source.value]
     return shlex.join([*words, "--out", str(out)])
 
 

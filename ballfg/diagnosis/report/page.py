@@ -105,10 +105,11 @@ def _finding(finding: Finding) -> Html:
     bic = f" {verb} by {abs(finding.delta_bic):.0f} with it."
     gained = f" it {gain} {wording.number(abs(finding.held_out_gain))} of "
     per_track = f" per track; probability of that by chance: {wording.probability(finding.held_out_p)}."
+    held = tag("span", "On the ", term("held-out tracks"), gained, term("log likelihood"), per_track)
     evidence += [
         tag("span", "Probability of so strong a ", term("trace"), by_chance),
         tag("span", "The model's ", term("BIC"), bic),
-        tag("span", "On the ", term("held-out tracks"), gained, term("log likelihood"), per_track),
+        *([held] if math.isfinite(finding.held_out_gain) else []),
         f"Cannot be told from {wording.joined(others)}."
         if others
         else "Of the candidates that were not refused no other explains as much.",
@@ -217,4 +218,9 @@ def _evaluation(diagnosis: Diagnosis) -> Html:
         "number of candidates and use the noise that the tracks show."
     )
     excluded = items(diagnosis.excluded)
-    return section("How it was evaluated", tag("p", words), tag("p", "Left out:") if excluded else "", excluded)
+    return section(
+        "How it was evaluated",
+        tag("p", diagnosis.evaluation or words),
+        tag("p", "Left out:") if excluded else "",
+        excluded,
+    )

@@ -32,6 +32,7 @@ def errors(diagnosis: Diagnosis) -> Html:
     said += "Both models were" if changed else "The model was"
     said += " fitted to the other tracks" + (", the declared one without what was added." if changed else ".")
     words = tag("p", f"Of {diagnosis.tracks_judged_on} ", term("held-out tracks"), said)
+    words = tag("p", diagnosis.evaluation) if diagnosis.evaluation else words
     if not changed:
         rows = [(name, _fixed(now, unit), goal) for name, _, now, unit, goal in numbers]
         shown = table(("", "value", "should be"), rows)

@@ -1,0 +1,1 @@
+"""Finds effects that a model lacks from the pixels of one camera."""

@@ -1,0 +1,222 @@
+"""Looks for what the laws lack in the strokes of one camera.
+
+All sets of effects are weighed about laws without any. The likeliest effects are then followed one by one: the most
+probable set that holds one moves the laws, until it is found where they are. A strength that is far off is not seen in
+one linear step, and of two effects that look alike from afar only the right one leaves nothing where it leads to.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, cast
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.evidence.odds import Odds
+from ballfg.diagnosis.evidence.prior import centres, scales
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, hypotheses, with_effects
+from ballfg.diagnosis.one_view.noise import with_likeliest_noise
+from ballfg.diagnosis.one_view.picture import ERRORS
+from ballfg.diagnosis.one_view.strokes import Laws, Stroke, all_estimated, scores_again
+from ballfg.diagnosis.one_view.weights import Set, Weights, mean_of, odds_of, slopes_of
+from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics.effect import Effect, Scene, Vector
+from ballfg.estimation import Settings
+from ballfg.state import POSITION, VELOCITY, VZ
+from ballfg.tracks.track import Track
+
+LEAST: Final = 20
+"""Strokes. With fewer, the scatter of as many scores from stroke to stroke is hardly known."""
+REPEATS: Final = 3  # Times that each stroke is filmed again with the laws of today
+ROUNDS: Final = 4
+FOLLOWED, FOLLOWED_FROM, WORSE = 3, 12.0, 2.0
+"""Largest number of effects that are followed; logarithms of odds by which the best set that holds one may fall short
+of the most probable one, and of none, about laws without any."""
+SETTLED: Final = 0.5  # Standard deviations by which a strength of the last round may have moved
+SEED: Final = 20_000
+
+
+@dataclass(frozen=True)
+class Found:
+    """The end of a search.
+
+    Attributes:
+        laws: of the most probable set.  weights: about them.  best: that set.  odds: of all sets.
+        strokes: as estimated with these laws.
+        first: the declared coefficients, fitted without any effect.
+    """
+
+    laws: Laws
+    weights: Weights
+    best: Set
+    odds: Odds
+    strokes: Sequence[Stroke]
+    first: Mapping[str, float]
+
+    @property
+    def declared(self) -> tuple[str, ...]:
+        """Names of the declared coefficients."""
+        return tuple(self.first)
+
+
+def search(
+    tracks: Sequence[Track],
+    model: AnalyticModel,
+    surfaces: Surfaces,
+    settings: Settings,
+    catalogue: Sequence[type[Effect]],
+    tell: Callable[[str], None],
+    jobs: int,
+) -> Found:
+    """What a model lacks, by the sightings of tracks that one camera saw.
+
+    Args: settings: their coefficients are those that are fitted to all strokes, with priors of these widths.
+    Raises: ValueError: fewer than `LEAST` strokes whose place is known well.
+    """
+    declared = {name: size for name, size in settings.coefficients.items()}
+    given = {name: float(value.detach()) for name, value in model.named_parameters()}
+    laws = Laws(model, surfaces, settings, declared, {name: given[name] for name in declared})
+    tell("estimating strokes")
+    strokes: Sequence[Stroke] = all_estimated(laws, tracks, jobs)
+    if len(strokes) < LEAST:
+        raise ValueError(
+            f"a diagnosis of one camera's strokes needs {LEAST} of them, each with a bounce in the picture that shows "
+            f"how far away it is; got {len(strokes)} of {len(tracks)}. Film more, or from higher above the table."
+        )
+    tell("looking at the noise of flights and bounces")
+    laws = with_likeliest_noise(laws, [stroke.track for stroke in strokes], jobs)
+    absent = np.array([given[name] for name in declared])
+    for number in range(2):
+        tell("fitting the declared coefficients")
+        place = _Place(laws, tracks, (), absent, jobs).weighed(number)
+        laws, strokes = place.moved(place.best).laws, place.strokes
+    first = dict(laws.values)
+    laws, asked, centre = _asking(laws, strokes, model, catalogue)
+    tell(f"filming strokes again with each of {len(asked)} effects")
+    start = _Place(laws, tracks, asked, np.append(absent, centre), jobs).weighed(2)
+    climbed = []
+    for name in _likely(start.weights):
+        tell(f"following {name}")
+        climbed.append(_climbed(start, name))
+        best = climbed[-1].best
+        tell("  " + ", ".join(f"{n} {value:.3g}" for n, value in zip(best.unknown, best.values, strict=True)))
+    places = (start, *climbed)
+    odds = odds_of([place.weights for place in places])
+    names = max(odds.models, key=lambda names: odds.models[names])
+    known = [(one, place) for place in places if (one := place.weights.known(names)) is not None]
+    best, end = max(known, key=lambda pair: pair[0].odds)
+    if not _is_settled(end, best):
+        tell("fitting the most probable effects")
+        end = end.moved(best).weighed(10 + ROUNDS)
+        best = end.weights.weighed([h for h in asked if h.name in names])
+    return Found(end.laws, end.weights, best, odds, end.strokes, first)
+
+
+def _likely(weights: Weights) -> list[str]:
+    """The effects that are worth following: each of them alone is not much less probable than none, and than all."""
+    odds = {h.name: weights.best_with(h.name).odds for h in weights.hypotheses}
+    least = max(weights.weighed(()).odds - WORSE, max(odds.values()) - FOLLOWED_FROM)
+    return sorted((name for name in odds if odds[name] > least), key=lambda name: -odds[name])[:FOLLOWED]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Laws, the weights about them, and the most probable set that was followed there."""
+
+    laws: Laws
+    tracks: Sequence[Track]
+    asked: Sequence[Hypothesis]
+    absent: Array
+    jobs: int
+    strokes: Sequence[Stroke] = ()
+    told: Weights | None = None
+    followed: Set | None = None
+
+    @property
+    def weights(self) -> Weights:
+        """About the laws."""
+        assert self.told is not None
+        return self.told
+
+    @property
+    def best(self) -> Set:
+        """The set that was followed; none if none was."""
+        return self.followed or self.weights.weighed(())
+
+    def weighed(self, number: int, slopes: Array | None = None) -> "_Place":
+        """The place with its weights; slopes: of laws nearby, in place of those of these laws."""
+        laws = self.laws
+        strokes = all_estimated(laws, self.tracks, self.jobs)
+        seeds = [SEED + 100 * number + k for k in range(REPEATS)]
+        bigger = [laws.moved({name: laws.values[name] + size}) for name, size in laws.sizes.items()]
+        changed = [] if slopes is not None else [(one, seeds[0]) for one in bigger]
+        scores = scores_again(laws, [*((laws, seed) for seed in seeds), *changed], strokes, self.jobs)
+        mean, spread = mean_of(np.array([stroke.scores for stroke in strokes]), scores[:REPEATS])
+        slopes = slopes_of(scores[0], scores[REPEATS:]) if slopes is None else slopes
+        names, sizes = tuple(laws.sizes), np.array(list(laws.sizes.values()))
+        values, declared = np.array([laws.values[name] for name in names]), len(laws.settings.coefficients)
+        arrays = (sizes, values, self.absent, declared, mean, spread, slopes)
+        return replace(self, strokes=strokes, told=Weights(names, *arrays, len(strokes), self.asked))
+
+    def moved(self, best: Set) -> "_Place":
+        """The place with the strengths of a set, and without all other effects."""
+        absent = dict(zip(self.weights.names, self.weights.absent.tolist(), strict=True))
+        laws = self.laws.moved(absent).moved(dict(zip(best.unknown, best.values.tolist(), strict=True)))
+        return replace(self, laws=laws, followed=best)
+
+
+def _climbed(start: _Place, name: str) -> _Place:
+    """The place of the most probable set that holds an effect: rounds with slopes of laws nearby, then of its own."""
+    place = start.moved(start.weights.best_with(name))
+    for number in range(ROUNDS):
+        slopes = place.weights.slopes if number < ROUNDS - 1 else None
+        place = place.weighed(10 + number, slopes)
+        best = place.weights.best_with(name)
+        same = best.names == place.best.names and _is_settled(place, best)
+        if same and slopes is not None:
+            place = place.weighed(10 + ROUNDS)
+            break
+        if number < ROUNDS - 1:
+            place = place.moved(best)
+    return replace(place, followed=place.weights.best_with(name))
+
+
+def _is_settled(place: _Place, best: Set) -> bool:
+    """True if the strengths of a set's effects, which follow the declared ones, are where the laws have them."""
+    now = np.array([place.laws.values[column] for column in best.unknown])
+    far = np.abs(best.values - now) / np.sqrt(np.diagonal(best.covariance))
+    return bool((far[place.weights.declared :] <= SETTLED).all())
+
+
+def _asking(
+    laws: Laws, strokes: Sequence[Stroke], model: AnalyticModel, catalogue: Sequence[type[Effect]]
+) -> tuple[Laws, list[Hypothesis], Array]:
+    """The laws with all effects of the catalogue that one camera can be asked about, and where each is absent.
+
+    Effects of one place in the room, which have many shapes, and those of positions and labels are left out.
+    """
+    listed = hypotheses(model, _scene(strokes), [e for e in catalogue if e.kind != "measurement"])
+    asked = [h for h in listed if h.strengths and h.choices == 1]
+    absent = [h.effect(**{**h.shape, **dict.fromkeys(h.strengths, 0.0)}) for h in asked if h.name not in _names(model)]
+    whole = with_effects(laws.model, *absent)
+    asked += [Hypothesis(error, strengths=(error.coefficients[0].name,)) for error in ERRORS]
+    columns = [column for h in asked for column in h.columns]
+    sizes = dict(zip(columns, np.concatenate([scales(h) for h in asked]).tolist(), strict=True))
+    centre = np.concatenate([centres(h, whole) for h in asked])
+    values = {**laws.values, **dict(zip(columns, centre.tolist(), strict=True))}
+    return replace(laws, model=whole, sizes={**laws.sizes, **sizes}, values=values), asked, centre
+
+
+def _names(model: AnalyticModel) -> set[str]:
+    return {name.split(".")[1] for name, _ in model.named_parameters()}
+
+
+def _scene(strokes: Sequence[Stroke]) -> Scene:
+    """The extent of strokes."""
+    states = np.concatenate([stroke.estimate.states for stroke in strokes])
+    places = states[:, POSITION]
+    falls = [float(-stroke.estimate.states[c.interval, VZ]) for stroke in strokes for c in stroke.estimate.contacts]
+    extent = (places.min(axis=0), places.max(axis=0), np.median(places, axis=0))
+    low, high, middle = (cast(Vector, tuple(place.tolist())) for place in extent)
+    speed = float(np.median(np.linalg.norm(states[:, VELOCITY], axis=1)))
+    return Scene(low, high, middle, speed, float(np.median(falls)) if falls else float("nan"), len(falls), 0)

@@ -1,0 +1,158 @@
+"""Estimates strokes with given laws, and films them again as these laws would have them.
+
+The derivatives of a stroke's objective by common strengths are its *scores*. Where depth comes from the motion they do
+not scatter about zero, right laws or not: a state that a wrong law fits better pulls its own estimate along. The same
+strokes filmed again have scores with the same pull, so that the difference of both is free of it (C. Gourieroux, A.
+Monfort, E. Renault, "Indirect inference", J. Appl. Econometrics 8, 1993).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients
+from ballfg.diagnosis.one_view.picture import NAMES, Picture, known_bounces, slopes
+from ballfg.dynamics import AnalyticModel, Surfaces
+from ballfg.dynamics.motion.rollout import rollout
+from ballfg.estimation import Estimate, Settings, Smoother, Status
+from ballfg.estimation.batch import do_all
+from ballfg.estimation.observations.sightings import sighted_track, sightings_of
+from ballfg.learning.calibration.population import evidence
+from ballfg.state import POSITION
+from ballfg.tracks.track import Track
+from ballfg.vision.projection import CameraBank
+
+HELD: Final = 0.1
+"""Prior standard deviation of a strength within one stroke, in usual sizes: so small that all strokes share a value."""
+TOGETHER: Final = 10  # Strokes of one task
+
+
+@dataclass(frozen=True)
+class Laws:
+    """Laws with values of all strengths that a diagnosis asks about.
+
+    Attributes:
+        model: with all effects that are asked about.
+        surfaces, settings: of the estimates.
+        sizes: usual size of each strength, by name: parameters of the model, or of `picture.NAMES`.
+        values: their values.
+    """
+
+    model: AnalyticModel
+    surfaces: Surfaces
+    settings: Settings
+    sizes: Mapping[str, float]
+    values: Mapping[str, float]
+
+    @property
+    def picture(self) -> Picture:
+        """Errors of clock and lens."""
+        return Picture.of(self.values)
+
+    def moved(self, values: Mapping[str, float]) -> "Laws":
+        """The laws with other values of some strengths."""
+        return replace(self, model=with_coefficients(self.model, values), values={**self.values, **values})
+
+    @property
+    def smoother(self) -> Smoother:
+        """The smoother with these laws, which leaves the strengths where they are."""
+        held = {name: HELD * size for name, size in self.sizes.items() if name not in NAMES}
+        return Smoother(self.model, self.surfaces, replace(self.settings, coefficients=held))
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A stroke.
+
+    Attributes:
+        track: as it was filmed.  clock: of the laws that it was estimated with.
+        estimate: with these laws, at true times.
+        scores: (p,) in the order of the laws' strengths, in one over their usual sizes.
+    """
+
+    track: Track
+    clock: float
+    estimate: Estimate
+    scores: Array
+
+
+def estimated(laws: Laws, smoother: Smoother, filmed: Track) -> Stroke | None:
+    """The estimate and the scores of a track as it was filmed; None if its place is not known well."""
+    track = laws.picture.seen_by(filmed, laws.model, laws.surfaces)
+    estimate = smoother.estimate(track)
+    if estimate.status is not Status.OK:
+        return None
+    names = list(smoother.settings.coefficients)
+    places = [estimate.coefficient_names.index(name) for name in names]
+    about, sigmas = np.array([laws.values[name] for name in names]), np.array([HELD * laws.sizes[n] for n in names])
+    covariance = estimate.coefficient_covariance[np.ix_(places, places)]
+    own = evidence(estimate.coefficients[places], covariance, about, sigmas).vector
+    found = dict(zip(names, own.tolist(), strict=True))
+    found |= dict(zip(NAMES, slopes(track, estimate, smoother.settings.sighting_loss).tolist(), strict=True))
+    scores = np.array([found[name] * size for name, size in laws.sizes.items()])
+    return Stroke(filmed, laws.picture.clock, estimate, scores) if np.isfinite(scores).all() else None
+
+
+def filmed_again(stroke: Stroke, laws: Laws, seed: Sequence[int]) -> Track | None:
+    """The track of a stroke's sightings if it flew by some laws, with their errors of clock and lens and new noise.
+
+    Returns: None if it would leave the camera's sight.
+    """
+    seen, rng = sightings_of(stroke.track), np.random.default_rng(seed)
+    sightings, first = seen.sightings, stroke.track.times[0]
+    since = (stroke.track.times[seen.state] + seen.delay - first) / (1.0 + stroke.clock)
+    slower = (1.0 + laws.picture.clock) / (1.0 + stroke.clock)
+    moments, place = np.unique(np.append(0.0, since), return_inverse=True)
+    with torch.no_grad():
+        given = torch.from_numpy(np.array(stroke.estimate.states[:1])), torch.from_numpy(moments)
+        path = np.asarray(rollout(laws.model, *given, laws.surfaces)[0])[place[1:]]
+    bank = CameraBank(tuple(laws.picture.camera(camera) for camera in seen.cameras))
+    pixels, _ = bank.jacobian(path[:, POSITION], sightings.camera)
+    if not np.isfinite(pixels).all():
+        return None
+    noise = np.linalg.cholesky(sightings.covariances) @ rng.standard_normal((len(pixels), 2, 1))
+    radii = sightings.radii
+    if radii is not None:
+        at = torch.from_numpy(path[:, POSITION].copy()), torch.from_numpy(sightings.camera)
+        size = bank.radius(*at, laws.model.radius)[0].numpy() + radii[:, 1] * rng.standard_normal(len(radii))
+        radii = np.stack((np.where(radii[:, 0] > 0.0, np.maximum(size, radii[:, 1]), 0.0), radii[:, 1]), axis=1)
+    written = sightings.times[0] + slower * (sightings.times - sightings.times[0])
+    filmed = replace(sightings, pixels=pixels + noise[..., 0], times=written, radii=radii)
+    given_bounces = known_bounces(seen, slower)
+    return sighted_track(
+        stroke.track.name, filmed, seen.cameras, model=laws.model, surfaces=laws.surfaces, bounces=given_bounces
+    )
+
+
+def all_estimated(laws: Laws, tracks: Sequence[Track], jobs: int) -> list[Stroke]:
+    """The strokes of all tracks whose place is known well."""
+    parts = [tracks[k : k + TOGETHER] for k in range(0, len(tracks), TOGETHER)]
+    return [one for part in do_all([partial(_estimates, laws, part) for part in parts], jobs) for one in part]
+
+
+def scores_again(laws: Laws, flown: Sequence[tuple[Laws, int]], strokes: Sequence[Stroke], jobs: int) -> list[Array]:
+    """Scores (n, p) under some laws of the strokes filmed again, for each of other laws and a seed of the noise.
+
+    The noise of a stroke is that of its number and the seed, so that changes of laws show at once.
+    """
+    numbered = list(enumerate(strokes))
+    parts = [numbered[k : k + TOGETHER] for k in range(0, len(numbered), TOGETHER)]
+    found = iter(do_all([partial(_again, laws, *others, part) for others in flown for part in parts], jobs))
+    return [np.concatenate([next(found) for _ in parts]) for _ in flown]
+
+
+def _estimates(laws: Laws, tracks: Sequence[Track]) -> list[Stroke]:
+    smoother = laws.smoother
+    return [stroke for track in tracks if (stroke := estimated(laws, smoother, track)) is not None]
+
+
+def _again(laws: Laws, others: Laws, seed: int, strokes: Sequence[tuple[int, Stroke]]) -> Array:
+    """(n, p) scores of the strokes whose place is known well this time too."""
+    filmed = (filmed_again(stroke, others, (seed, number)) for number, stroke in strokes)
+    found = _estimates(laws, [track for track in filmed if track is not None])
+    return np.array([stroke.scores for stroke in found]).reshape(len(found), len(laws.sizes))
