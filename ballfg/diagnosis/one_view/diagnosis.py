@@ -97,11 +97,11 @@ def told(
         predicted: the errors of a model with a camera's errors.  name_at: as for `diagnose`.
     """
     named = _named(found, name_at)
-    plain, best = found.weights.weighed(()), found.weights.weighed(named)
-    before, after = with_values(declared, found.first), _model(declared, best, named)
+    plain, best, fitted = found.weights.weighed(()), found.weights.weighed(named), found.weights.fitted(named)
+    before, after = with_values(declared, found.first), _model(declared, fitted, named)
     was = predicted(before, Picture())
-    now = predicted(after, Picture.of(_strengths(best))) if named else was
-    left, findings = _left(found, plain, best), tuple(_finding(found, one, best) for one in named)
+    now = predicted(after, Picture.of(_strengths(fitted))) if named else was
+    left, findings = _left(found, plain, best), tuple(_finding(found, one, best, fitted) for one in named)
     verdict = Verdict.FOUND if findings else Verdict.NOTHING
     if left.tests[0].p_value < ALARM:
         verdict = Verdict.UNEXPLAINED
@@ -120,7 +120,7 @@ def told(
         after=now,
         tracks_found_on=count,
         tracks_judged_on=len(was.by_track),
-        calibrated=_calibrated(found, best, declared),
+        calibrated=_calibrated(found, fitted, declared),
         noise={},
         unexplained=left,
         model=after,
@@ -196,13 +196,13 @@ def _judged(
     return judge_track(smoother, picture.seen_by(track, model, surfaces), OBSERVED, np.inf)
 
 
-def _finding(found: Found, one: Hypothesis, best: Set) -> Finding:
-    """A named effect with its evidence."""
+def _finding(found: Found, one: Hypothesis, best: Set, fitted: Set) -> Finding:
+    """A named effect with its evidence, and its strengths as they were fitted."""
     weights, odds = found.weights, found.odds
-    places = [best.unknown.index(column) for column in one.columns]
-    sigmas = np.sqrt(np.diagonal(best.covariance))
+    places = [fitted.unknown.index(column) for column in one.columns]
+    sigmas = np.sqrt(np.diagonal(fitted.covariance))
     values = {
-        name: Value(float(best.values[place]), float(sigmas[place]), one.coefficients[name].unit)
+        name: Value(float(fitted.values[place]), float(sigmas[place]), one.coefficients[name].unit)
         for name, place in zip(one.strengths, places, strict=True)
     }
     rest = weights.weighed([h for h in weights.hypotheses if h.name in best.names - {one.name}])

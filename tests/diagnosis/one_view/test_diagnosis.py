@@ -96,7 +96,7 @@ def test_sixty_strokes(name: str | None, truth: BallModel, picture: Picture, tmp
     planted = {"wind": {"x": 0.5}, "time_scale": {"s": 0.04}, "distortion": {"k1": -0.1}}.get(name or "", {})
     for coefficient, value in planted.items():
         got = found.findings[0].parameters[coefficient]
-        assert abs(got.value - value) < max(4.0 * got.sigma, 0.25 * abs(value))
+        assert abs(got.value - value) < 4.0 * got.sigma
 
 
 def test_too_few_strokes_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -61,6 +61,22 @@ def test_strengths_are_where_they_were_planted() -> None:
     assert (np.abs(test.estimate - truth[1:4]) < 2.0 * test.sigma).all()
 
 
+def test_a_set_is_fitted_by_its_own_scores() -> None:
+    """Those of its strengths and of the declared coefficients, by ridge regression with all others absent."""
+    weights = made(np.random.default_rng(6).standard_normal(5))
+    decay = weights.hypotheses[1]
+    found, rows = weights.fitted([decay]), [0, 4]
+    away = (weights.absent - weights.values) / weights.sizes
+    left = (weights.mean - weights.slopes @ away)[rows]
+    slopes, inverse = weights.slopes[np.ix_(rows, rows)], np.linalg.inv(weights.spread[np.ix_(rows, rows)])
+    fits = []
+    for width in TRIED:
+        precision = slopes.T @ inverse @ slopes + np.diag([1.0, width**-2])
+        fits.append(weights.absent[rows] + weights.sizes[rows] * np.linalg.solve(precision, slopes.T @ inverse @ left))
+    assert found.unknown == (DRAG, *decay.columns)
+    assert min(np.abs(found.values - fit).max() for fit in fits) < 1e-12
+
+
 def test_misfits_of_right_laws_are_uniform() -> None:
     """With a covariance that is as well known as that of so many strokes."""
     rng, found = np.random.default_rng(11), []
