@@ -103,20 +103,36 @@ def search(
         climbed.append(_climbed(start, name))
         best = climbed[-1].best
         tell("  " + ", ".join(f"{n} {value:.3g}" for n, value in zip(best.unknown, best.values, strict=True)))
-    places = (start, *climbed)
+    places = [start, *climbed]
     odds = odds_of([place.weights for place in places])
-    names = max(odds.models, key=lambda names: odds.models[names])
-    known = [(one, place) for place in places if (one := place.weights.known(names)) is not None]
-    best, end = max(known, key=lambda pair: pair[0].odds)
-    tell("fitting the most probable effects")
-    listed = [h for h in asked if h.name in names]
-    for _ in range(MOST_STEPS if listed else 0):
-        fitted = end.weights.fitted(listed)
-        if _is_settled(end, fitted):
+    for _ in range(ROUNDS):
+        names = max(odds.models, key=lambda names: odds.models[names])
+        end = max(places, key=lambda place: _odds_at(place, names))
+        listed = [h for h in asked if h.name in names]
+        tell("fitting the most probable effects")
+        places.append(_fitted(end, listed))
+        odds = odds_of([place.weights for place in places])
+        if names == max(odds.models, key=lambda names: odds.models[names]):
             break
-        end = end.moved(fitted).weighed(end.weights.slopes)
+    end = places[-1]
     best = end.weights.weighed(listed)
     return Found(end.laws, end.weights, best, odds, end.strokes, first)
+
+
+def _odds_at(place: "_Place", names: frozenset[str]) -> float:
+    """The odds of a set about the laws of a place; -inf if it was not weighed there."""
+    one = place.weights.known(names)
+    return -np.inf if one is None else one.odds
+
+
+def _fitted(place: "_Place", listed: Sequence[Hypothesis]) -> "_Place":
+    """The place to which the strengths of some effects lead; that of laws without any stays."""
+    for _ in range(MOST_STEPS if listed else 0):
+        found = place.weights.fitted(listed)
+        if _is_settled(place, found):
+            break
+        place = place.moved(found).weighed(place.weights.slopes)
+    return place
 
 
 def _likely(weights: Weights) -> list[str]:
