@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.checks import check_range
 from ballfg.diagnosis.fit.holdout import analytic
 from ballfg.diagnosis.generic_test import ALARM, GenericTest
-from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis, with_coefficients, with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis, has_effect, with_coefficients, with_effects
 from ballfg.diagnosis.one_view.noise import share_of
 from ballfg.diagnosis.one_view.picture import ERRORS, Picture
 from ballfg.diagnosis.one_view.search import Found, search
@@ -100,7 +100,7 @@ def told(
     plain, best, fitted = found.weights.weighed(()), found.weights.weighed(named), found.weights.fitted(named)
     before, after = with_values(declared, found.first), _model(declared, fitted, named)
     was = predicted(before, Picture())
-    now = predicted(after, Picture.of(_strengths(fitted))) if named else was
+    now = predicted(after, Picture.of(fitted.strengths)) if named else was
     left, findings = _left(found, plain, best), tuple(_finding(found, one, best, fitted) for one in named)
     verdict = Verdict.FOUND if findings else Verdict.NOTHING
     if left.tests[0].p_value < ALARM:
@@ -141,17 +141,13 @@ def _named(found: Found, name_at: float) -> list[Hypothesis]:
     return [h for h in chosen if odds.together(h.name, names) >= name_at]
 
 
-def _strengths(one: Set) -> dict[str, float]:
-    return dict(zip(one.unknown, one.values.tolist(), strict=True))
-
-
 def _model(declared: AnalyticModel, one: Set, named: Sequence[Hypothesis]) -> AnalyticModel:
     """The declared model with a set's values, and with the effects of those named that act on the ball."""
-    values, sigmas = _strengths(one), dict(zip(one.unknown, np.sqrt(np.diagonal(one.covariance)).tolist(), strict=True))
+    values, sigmas = one.strengths, dict(zip(one.unknown, one.sigmas.tolist(), strict=True))
     added = []
     for hypothesis in named:
         names = dict(zip(hypothesis.strengths, hypothesis.columns, strict=True))
-        if hypothesis.effect not in ERRORS and names[hypothesis.strengths[0]] not in dict(declared.named_parameters()):
+        if hypothesis.effect not in ERRORS and not has_effect(declared, hypothesis.name):
             effect = hypothesis.effect(**{**hypothesis.shape, **{name: values[full] for name, full in names.items()}})
             effect.set_sigmas(**{name: sigmas[full] for name, full in names.items()})
             added.append(effect)
@@ -174,7 +170,7 @@ def errors_across(
     settings: Settings,
     jobs: int,
 ) -> Errors:
-    """Errors of predictions across the rays, with what a camera's errors leave of them."""
+    """Errors of predictions across the rays, by a camera whose errors are known."""
     judge = partial(_judged, Smoother(model, surfaces, settings), picture, model, surfaces)
     scores = [score for score in map_tracks(judge, tracks, len(tracks), jobs) if score is not None]
     whole, nan = summary(scores), float("nan")
@@ -200,9 +196,8 @@ def _finding(found: Found, one: Hypothesis, best: Set, fitted: Set) -> Finding:
     """A named effect with its evidence, and its strengths as they were fitted."""
     weights, odds = found.weights, found.odds
     places = [fitted.unknown.index(column) for column in one.columns]
-    sigmas = np.sqrt(np.diagonal(fitted.covariance))
     values = {
-        name: Value(float(fitted.values[place]), float(sigmas[place]), one.coefficients[name].unit)
+        name: Value(float(fitted.values[place]), float(fitted.sigmas[place]), one.coefficients[name].unit)
         for name, place in zip(one.strengths, places, strict=True)
     }
     rest = weights.weighed([h for h in weights.hypotheses if h.name in best.names - {one.name}])
@@ -236,9 +231,8 @@ def _left(found: Found, plain: Set, best: Set) -> Unexplained:
 
 def _calibrated(found: Found, best: Set, declared: AnalyticModel) -> Mapping[str, Value]:
     given, units = dict(declared.named_parameters()), declared.declared_coefficients()
-    sigmas = np.sqrt(np.diagonal(best.covariance))
     return {
-        name: Value(float(best.values[k]), float(sigmas[k]), units[name].unit, float(given[name].detach()))
+        name: Value(float(best.values[k]), float(best.sigmas[k]), units[name].unit, float(given[name].detach()))
         for k, name in enumerate(found.declared)
     }
 

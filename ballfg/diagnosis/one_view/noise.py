@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.diagnosis.one_view.strokes import TOGETHER, Laws
+from ballfg.diagnosis.one_view.strokes import Laws, parts_of
 from ballfg.estimation import Settings
 from ballfg.estimation.batch import do_all
 from ballfg.state import STATE_DIM
@@ -35,8 +35,7 @@ def share_of(settings: Settings) -> float:
 def with_likeliest_noise(laws: Laws, tracks: Sequence[Track], jobs: int) -> Laws:
     """The laws with the share of their settings' noise that makes the sightings of tracks most probable."""
     offered = [replace(laws, settings=with_share(laws.settings, share)) for share in SHARES]
-    parts = [tracks[k : k + TOGETHER] for k in range(0, len(tracks), TOGETHER)]
-    found = do_all([partial(_densities, one, part) for one in offered for part in parts], jobs)
+    found = do_all([partial(_densities, one, part) for one in offered for part in parts_of(tracks)], jobs)
     densities = np.concatenate(found).reshape(len(SHARES), len(tracks))
     densities += -np.log(SHARES)[:, None] * [[STATE_DIM * (len(track) - 1) for track in tracks]]
     known = np.isfinite(densities).all(axis=0)

@@ -14,7 +14,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.odds import Odds
 from ballfg.diagnosis.evidence.prior import centres, scales
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, hypotheses, with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, hypotheses
 from ballfg.diagnosis.one_view.noise import with_likeliest_noise
 from ballfg.diagnosis.one_view.picture import ERRORS
 from ballfg.diagnosis.one_view.strokes import Laws, Stroke, all_estimated, scores_again
@@ -76,7 +76,7 @@ def search(
     Args: settings: their coefficients are those that are fitted to all strokes, with priors of these widths.
     Raises: ValueError: fewer than `LEAST` strokes whose place is known well.
     """
-    declared = {name: size for name, size in settings.coefficients.items()}
+    declared = dict(settings.coefficients)
     given = {name: float(value.detach()) for name, value in model.named_parameters()}
     laws = Laws(model, surfaces, settings, declared, {name: given[name] for name in declared})
     tell("estimating strokes")
@@ -101,8 +101,7 @@ def search(
     for name in _likely(start.weights):
         tell(f"following {name}")
         climbed.append(_climbed(start, name))
-        best = climbed[-1].best
-        tell("  " + ", ".join(f"{n} {value:.3g}" for n, value in zip(best.unknown, best.values, strict=True)))
+        tell("  " + ", ".join(f"{n} {value:.3g}" for n, value in climbed[-1].best.strengths.items()))
     places = [start, *climbed]
     odds = odds_of([place.weights for place in places])
     for _ in range(ROUNDS):
@@ -187,8 +186,7 @@ class _Place:
     def moved(self, best: Set) -> "_Place":
         """The place with the strengths of a set, and without all other effects."""
         absent = dict(zip(self.weights.names, self.weights.absent.tolist(), strict=True))
-        laws = self.laws.moved(absent).moved(dict(zip(best.unknown, best.values.tolist(), strict=True)))
-        return replace(self, laws=laws, followed=best)
+        return replace(self, laws=self.laws.moved(absent | best.strengths), followed=best)
 
 
 def _climbed(start: _Place, name: str) -> _Place:
@@ -210,7 +208,7 @@ def _climbed(start: _Place, name: str) -> _Place:
 def _is_settled(place: _Place, best: Set) -> bool:
     """True if the strengths of a set's effects, which follow the declared ones, are where the laws have them."""
     now = np.array([place.laws.values[column] for column in best.unknown])
-    far = np.abs(best.values - now) / np.sqrt(np.diagonal(best.covariance))
+    far = np.abs(best.values - now) / best.sigmas
     return bool((far[place.weights.declared :] <= SETTLED).all())
 
 
@@ -225,18 +223,15 @@ def _asking(
     known = [e for e in catalogue if e.kind != "measurement" and e.name not in CLOCKS]
     listed = hypotheses(model, _scene(strokes), known)
     asked = [h for h in listed if h.strengths and h.choices == 1]
-    absent = [h.effect(**{**h.shape, **dict.fromkeys(h.strengths, 0.0)}) for h in asked if h.name not in _names(model)]
-    whole = with_effects(laws.model, *absent)
+    whole = laws.model
+    for hypothesis in asked:
+        whole = hypothesis.added_to(whole)
     asked += [Hypothesis(error, strengths=(error.coefficients[0].name,)) for error in ERRORS]
     columns = [column for h in asked for column in h.columns]
     sizes = dict(zip(columns, np.concatenate([scales(h) for h in asked]).tolist(), strict=True))
     centre = np.concatenate([centres(h, whole) for h in asked])
     values = {**laws.values, **dict(zip(columns, centre.tolist(), strict=True))}
     return replace(laws, model=whole, sizes={**laws.sizes, **sizes}, values=values), asked, centre
-
-
-def _names(model: AnalyticModel) -> set[str]:
-    return {name.split(".")[1] for name, _ in model.named_parameters()}
 
 
 def _scene(strokes: Sequence[Stroke]) -> Scene:

@@ -9,7 +9,7 @@ Monfort, E. Renault, "Indirect inference", J. Appl. Econometrics 8, 1993).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import torch
@@ -26,6 +26,8 @@ from ballfg.learning.calibration.population import evidence
 from ballfg.state import POSITION
 from ballfg.tracks.track import Track
 from ballfg.vision.projection import CameraBank
+
+T = TypeVar("T")
 
 HELD: Final = 0.1
 """Prior standard deviation of a strength within one stroke, in usual sizes: so small that all strokes share a value."""
@@ -131,8 +133,9 @@ def filmed_again(stroke: Stroke, laws: Laws, seed: Sequence[int]) -> Track | Non
 
 def all_estimated(laws: Laws, tracks: Sequence[Track], jobs: int) -> list[Stroke]:
     """The strokes of all tracks whose place is known well."""
-    parts = [tracks[k : k + TOGETHER] for k in range(0, len(tracks), TOGETHER)]
-    return [one for part in do_all([partial(_estimates, laws, part) for part in parts], jobs) for one in part]
+    return [
+        one for part in do_all([partial(_estimates, laws, part) for part in parts_of(tracks)], jobs) for one in part
+    ]
 
 
 def scores_again(laws: Laws, flown: Sequence[tuple[Laws, int]], strokes: Sequence[Stroke], jobs: int) -> list[Array]:
@@ -140,10 +143,14 @@ def scores_again(laws: Laws, flown: Sequence[tuple[Laws, int]], strokes: Sequenc
 
     The noise of a stroke is that of its number and the seed, so that changes of laws show at once.
     """
-    numbered = list(enumerate(strokes))
-    parts = [numbered[k : k + TOGETHER] for k in range(0, len(numbered), TOGETHER)]
+    parts = parts_of(list(enumerate(strokes)))
     found = iter(do_all([partial(_again, laws, *others, part) for others in flown for part in parts], jobs))
     return [np.concatenate([next(found) for _ in parts]) for _ in flown]
+
+
+def parts_of(items: Sequence[T]) -> list[Sequence[T]]:
+    """The items in tasks of `TOGETHER`."""
+    return [items[k : k + TOGETHER] for k in range(0, len(items), TOGETHER)]
 
 
 def _estimates(laws: Laws, tracks: Sequence[Track]) -> list[Stroke]:

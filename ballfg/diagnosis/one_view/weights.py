@@ -46,7 +46,8 @@ class Set:
         evidence: logarithm of the density of the mean scores, up to a constant. Laws that lack what scatters from
             stroke to stroke have a wide one.
         odds: the same with the prior odds of the effects.
-        values, covariance: (q,), (q, q) of the strengths of the set, with the declared coefficients first.
+        unknown: names of the q strengths of the set, with the declared coefficients first.
+        values, covariance: (q,), (q, q) of them.
         misfit: chi-square of the scores about them.
     """
 
@@ -57,6 +58,16 @@ class Set:
     values: Array
     covariance: Array
     misfit: float
+
+    @property
+    def sigmas(self) -> Array:
+        """(q,) standard deviations of the strengths."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def strengths(self) -> dict[str, float]:
+        """The strengths by name."""
+        return dict(zip(self.unknown, self.values.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
