@@ -35,6 +35,7 @@ of the most probable one, and of none, about laws without any."""
 MOST_STEPS: Final = 12  # Rounds of the most probable set: each takes strengths about half of the way that is left
 SETTLED: Final = 0.25  # Standard deviations by which a strength of the last round may have moved
 SEED: Final = 20_000
+LIFT: Final = "flight.magnus.k"
 CLOCKS: Final = ("gravity", "buoyancy")
 """Effects that do what a clock does that runs wrong: g is known to a thousandth, a frame rate often is not."""
 
@@ -46,7 +47,7 @@ class Found:
     Attributes:
         laws: of the most probable set.  weights: about them.  best: that set.  odds: of all sets.
         strokes: as estimated with these laws.
-        first: the declared coefficients, fitted without any effect.
+        first: the declared coefficients and the lift, fitted without any effect.
     """
 
     laws: Laws
@@ -54,12 +55,7 @@ class Found:
     best: Set
     odds: Odds
     strokes: Sequence[Stroke]
-    first: Mapping[str, float]
-
-    @property
-    def declared(self) -> tuple[str, ...]:
-        """Names of the declared coefficients."""
-        return tuple(self.first)
+    first: Set
 
 
 def search(
@@ -73,12 +69,14 @@ def search(
 ) -> Found:
     """What a model lacks, by the sightings of tracks that one camera saw.
 
-    Args: settings: their coefficients are those that are fitted to all strokes, with priors of these widths.
+    Args: settings: their coefficients are fitted to all strokes, with priors of these widths, and so is the lift.
     Raises: ValueError: fewer than `LEAST` strokes whose place is known well.
     """
     declared = dict(settings.coefficients)
+    with_lift = declared | _lift(model)
     given = {name: float(value.detach()) for name, value in model.named_parameters()}
-    laws = Laws(model, surfaces, settings, declared, {name: given[name] for name in declared})
+    stated = {name: given[name] for name in with_lift}
+    laws = Laws(model, surfaces, replace(settings, coefficients=with_lift), with_lift, stated)
     tell("estimating strokes")
     strokes: Sequence[Stroke] = all_estimated(laws, tracks, jobs)
     if len(strokes) < LEAST:
@@ -88,12 +86,12 @@ def search(
         )
     tell("looking at the noise of flights and bounces")
     laws = with_likeliest_noise(laws, [stroke.track for stroke in strokes], jobs)
-    absent = np.array([given[name] for name in declared])
     for _ in range(2):
         tell("fitting the declared coefficients")
-        place = _Place(laws, tracks, (), absent, jobs).weighed()
-        laws, strokes = place.moved(place.best).laws, place.strokes
-    first = dict(laws.values)
+        place = _Place(laws, tracks, (), np.array(list(stated.values())), jobs).weighed()
+        first = place.best
+        laws, strokes = place.moved(first).laws, place.strokes
+    laws, absent = _held(laws, declared), np.array([given[name] for name in declared])
     laws, asked, centre = _asking(laws, strokes, model, catalogue)
     tell(f"filming strokes again with each of {len(asked)} effects")
     start = _Place(laws, tracks, asked, np.append(absent, centre), jobs).weighed()
@@ -116,6 +114,18 @@ def search(
     end = places[-1]
     best = end.weights.weighed(listed)
     return Found(end.laws, end.weights, best, odds, end.strokes, first)
+
+
+def _lift(model: AnalyticModel) -> dict[str, float]:
+    """The prior standard deviation of the lift: strokes without spin labels show it together, at their bounces."""
+    lift = model.declared_coefficients().get(LIFT)
+    return {} if lift is None or not lift.sigma > 0.0 else {LIFT: lift.sigma}
+
+
+def _held(laws: Laws, asked: Mapping[str, float]) -> Laws:
+    """The laws that ask about some strengths alone, of these sizes; the others stay where they are."""
+    settings = replace(laws.settings, coefficients=dict(asked))
+    return replace(laws, settings=settings, sizes=asked, values={name: laws.values[name] for name in asked})
 
 
 def _odds_at(place: "_Place", names: frozenset[str]) -> float:

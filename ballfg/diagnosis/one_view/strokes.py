@@ -23,7 +23,7 @@ from ballfg.estimation import Estimate, Settings, Smoother, Status
 from ballfg.estimation.batch import do_all
 from ballfg.estimation.observations.sightings import sighted_track, sightings_of
 from ballfg.learning.calibration.population import evidence
-from ballfg.state import POSITION
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks.track import Track
 from ballfg.vision.projection import CameraBank
 
@@ -32,6 +32,7 @@ T = TypeVar("T")
 HELD: Final = 0.1
 """Prior standard deviation of a strength within one stroke, in usual sizes: so small that all strokes share a value."""
 TOGETHER: Final = 10  # Strokes of one task
+BOUNCED: Final = 1.0  # m/s, rise of the vertical velocity that only a bounce makes
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def estimated(laws: Laws, smoother: Smoother, filmed: Track) -> Stroke | None:
 
 
 def filmed_again(stroke: Stroke, laws: Laws, seed: Sequence[int]) -> Track | None:
-    """The track of a stroke's sightings if it flew by some laws, with their errors of clock and lens and new noise.
+    """The track of a stroke's sightings if one like it flew by some laws, with their clock and lens and new noise.
 
     Returns: None if it would leave the camera's sight.
     """
@@ -110,9 +111,7 @@ def filmed_again(stroke: Stroke, laws: Laws, seed: Sequence[int]) -> Track | Non
     since = (stroke.track.times[seen.state] + seen.delay - first) / (1.0 + stroke.clock)
     slower = (1.0 + laws.picture.clock) / (1.0 + stroke.clock)
     moments, place = np.unique(np.append(0.0, since), return_inverse=True)
-    with torch.no_grad():
-        given = torch.from_numpy(np.array(stroke.estimate.states[:1])), torch.from_numpy(moments)
-        path = np.asarray(rollout(laws.model, *given, laws.surfaces)[0])[place[1:]]
+    path = _flown(stroke, laws, moments, rng)[place[1:]]
     bank = CameraBank(tuple(laws.picture.camera(camera) for camera in seen.cameras))
     pixels, _ = bank.jacobian(path[:, POSITION], sightings.camera)
     if not np.isfinite(pixels).all():
@@ -129,6 +128,29 @@ def filmed_again(stroke: Stroke, laws: Laws, seed: Sequence[int]) -> Track | Non
     return sighted_track(
         stroke.track.name, filmed, seen.cameras, model=laws.model, surfaces=laws.surfaces, bounces=given_bounces
     )
+
+
+def _flown(stroke: Stroke, laws: Laws, moments: Array, rng: np.random.Generator) -> Array:
+    """(k, 9) states at moments (k,) s, from zero on, of a stroke that may have begun as this one did."""
+    noise, found = laws.settings.for_track(stroke.track).process, stroke.estimate
+    bounces = np.array([contact.time for contact in found.contacts]) - found.times[0]
+    slip = float(np.hypot(noise.contact_velocity, noise.contact_tangential))
+    steps = np.diff(moments)
+    scatter = np.linalg.cholesky(noise.flight(steps)) @ rng.standard_normal((len(steps), STATE_DIM, 1))
+    path = [found.states[0] + np.linalg.cholesky(found.covariances[0]) @ rng.standard_normal(STATE_DIM)]
+    for step, end, scattered in zip(steps, moments[1:], scatter[..., 0], strict=True):
+        with torch.no_grad():
+            given = torch.from_numpy(path[-1][None].copy()), torch.tensor([0.0, step], dtype=torch.float64)
+            state = rollout(laws.model, *given, laws.surfaces)[0, 1].numpy()
+        if state[VZ] - path[-1][VZ] > BOUNCED:
+            nearest = bounces[np.argmin(np.abs(bounces - end + 0.5 * step))] if len(bounces) else end - 0.5 * step
+            since = np.clip(end - nearest, 0.0, step)  # s after the bounce
+            kick = rng.standard_normal(3) * (slip, slip, noise.contact_velocity)
+            state[VELOCITY] += kick
+            state[POSITION] += since * kick
+            state[SPIN] += noise.contact_spin * rng.standard_normal(3)
+        path.append(state + scattered)
+    return np.array(path)
 
 
 def all_estimated(laws: Laws, tracks: Sequence[Track], jobs: int) -> list[Stroke]:
