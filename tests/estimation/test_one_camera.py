@@ -11,9 +11,7 @@ import torch
 
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation import Status
-from ballfg.estimation.one_camera import Strokes, _cut, track_one_camera
-from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.tracks.sightings import Sightings
+from ballfg.estimation.one_camera import Strokes, track_one_camera
 from ballfg.vision.detection.detections import Candidates, Detections
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
 
@@ -86,17 +84,6 @@ def test_a_rally_is_cut_at_its_hits(ball: World) -> None:
     ball_one = strokes.tracking.balls[0]
     np.testing.assert_array_equal(ball_one.points, strokes.estimates[0].states[:, :3])
     assert strokes.tracking.seen(ball_one, 0).frames[0] == pytest.approx(HITS[0] * RATE, abs=5)
-
-
-def test_motion_that_is_smooth_through_hits_is_cut_there(ball: World) -> None:
-    """A chain of one piece that holds three strokes: flights stop explaining it at the hits, to three frames."""
-    times, states = rally(ball)
-    pixels = SIDE.project(states[:, :3]) + NOISE * np.random.default_rng(6).standard_normal((len(times), 2))
-    spread = np.tile(NOISE**2 * np.eye(2), (len(times), 1, 1))
-    whole = Sightings(("side",), np.zeros(len(times), dtype=np.int64), times, pixels, spread)
-    strokes = _cut([whole], SIDE, Smoother(ball.model, ball.surfaces))
-    assert [stroke.times[0] for stroke in strokes] == pytest.approx(HITS[:-1], abs=0.07)
-    assert sum(len(stroke) for stroke in strokes) == len(times)
 
 
 def test_what_does_not_fall_is_no_ball(ball: World) -> None:
