@@ -7,9 +7,11 @@ import numpy as np
 from ballfg.arrays import Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.sightings import LEAST_SEEN
-from ballfg.estimation.rally.reconstruct import strokes_of
+from ballfg.estimation.observations.sightings import LEAST_SEEN, sighted_track
+from ballfg.estimation.rally.reconstruct import search
 from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
 from ballfg.state import POSITION
 from ballfg.tracks.sightings import Sightings
@@ -42,21 +44,22 @@ def track_one_camera(
         detections: all candidates of the camera, good and bad.  camera: with its place.
         model, surfaces: of the ball, and of what it bounces on.  watch: sees the flights that are followed.
     """
-    one = strokes_of(detections, camera, model, surfaces, watch=watch)
-    pairs = [(stroke.rows, estimate) for stroke, estimate in zip(one.chosen.strokes, one.estimates, strict=True)]
-    pairs.sort(key=lambda pair: float(pair[1].times[0]))
-    pairs = [pair for pair in pairs if len(pair[0]) >= LEAST_SEEN]  # others could not be estimated from a dataset
-    balls = tuple(_ball(one.seen, *pair) for pair in pairs)
-    tracking = Tracking((camera,), (one.seen,), balls, None)
+    smoother, pairs = Smoother(model, surfaces, Settings.for_measured(model)), list[tuple[SeenBall, Estimate]]()
+    strokes = search(detections, camera, model, surfaces, watch=watch)[0].strokes
+    for stroke in watch(strokes, len(strokes), "strokes estimated"):
+        if len(stroke.rows) >= LEAST_SEEN:  # alone and by its sightings, as it is estimated again from a dataset
+            seen = _sightings(detections, stroke.rows)
+            estimate = smoother.estimate(sighted_track("stroke", seen, [camera], model=model, surfaces=surfaces))
+            positions, views = estimate.states[:, POSITION], np.ones(len(estimate), dtype=np.int64)
+            spread = estimate.covariances[:, POSITION, POSITION]
+            pairs.append((SeenBall(estimate.times, positions, spread, seen, views), estimate))
+    pairs.sort(key=lambda pair: float(pair[0].times[0]))
+    tracking = Tracking((camera,), (detections,), tuple(ball for ball, _ in pairs), None)
     named = zip(tracking.names, pairs, strict=True)
     return Strokes(tracking, tuple(replace(estimate, name=name) for name, (_, estimate) in named))
 
 
-def _ball(seen: Detections, rows: Index, estimate: Estimate) -> SeenBall:
-    """The ball of an estimate and of its candidates."""
+def _sightings(seen: Detections, rows: Index) -> Sightings:
+    """Some candidates as the sightings of one ball."""
     own = (seen.times[rows], seen.pixels[rows], seen.covariances[rows])
-    sightings = Sightings((seen.camera,), np.zeros(len(rows), dtype=np.int64), *own)
-    views = np.ones(len(estimate.times), dtype=np.int64)
-    return SeenBall(
-        estimate.times, estimate.states[:, POSITION], estimate.covariances[:, POSITION, POSITION], sightings, views
-    )
+    return Sightings((seen.camera,), np.zeros(len(rows), dtype=np.int64), *own)

@@ -98,10 +98,10 @@ def main() -> None:
             good = {number for number, share, error in found if share > COVERED and error < NEAR}
             row = np.array([len(strokes), len(good), len(estimates), len(estimates) - len(found)])
             totals += row
-            median = 1e3 * np.median([error for *_, error in found])
+            median, spent = 1e3 * np.median([error for *_, error in found]), time.process_time() - begun
             print(
-                f"{seed} {camera.name}: {row[1]} of {row[0]} found, {row[3]} of {row[2]} false, median {median:.0f} mm, "
-                f"{time.process_time() - begun:.0f} s",
+                f"{seed} {camera.name}: {row[1]} of {row[0]} found, {row[3]} of {row[2]} false, "
+                f"median {median:.0f} mm, {spent:.0f} s",
                 flush=True,
             )
     print(f"found {100 * totals[1] / totals[0]:.1f} %, false {100 * totals[3] / totals[2]:.1f} %")

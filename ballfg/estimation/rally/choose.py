@@ -132,7 +132,7 @@ def with_others(grower: Grower, chosen: Chosen, strokes: Sequence[Stroke]) -> Ch
 
 
 def _shown(grower: Grower, stroke: Stroke) -> bool:
-    """True if a stroke that no hit joins to another is a ball's: it bounces, or gravity shows, where any flight counts."""
+    """True if a stroke without a hit is a ball's: it bounces or, where any flight counts, shows how it falls."""
     field = grower.field
     first, last = field.stamps[field.frame[stroke.rows[[0, -1]]]]
     return stroke.path.bounces > 0 or (not field.play and last - first >= telling(field))

@@ -43,7 +43,7 @@ def ends_of(surfaces: Surfaces) -> Array | None:
 
 
 def at_court(camera: Camera, surfaces: Surfaces) -> tuple[float, float]:
-    """px for a m at the court's middle, and px/s^2 of a free fall there, both across a camera's line of sight.
+    """Pixels for a m at the court's middle, and px/s^2 of a free fall there, both across a camera's line of sight.
 
     Of a court without known ends the place counts that the middle of the picture shows.
 

@@ -143,9 +143,9 @@ def strokes_of(
         seen_share: probability that the ball is among the candidates of a picture, at first.
         play: True for one ball in play, as `Field` has it; False for all flights, of several balls too.
     """
-    if len(np.unique(seen.frame)) < LEAST:
-        return ShotRally(camera, seen, NOTHING, (), (), 0.0)
-    chosen, field = _searched(seen, camera, model, surfaces, seen_share, play, watch)
+    chosen, field = search(seen, camera, model, surfaces, seen_share, play=play, watch=watch)
+    if field is None:
+        return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     kinked = _kinked(chosen, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None), chosen, kinked)
@@ -160,19 +160,25 @@ def strokes_of(
     return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), tuple(hits), field.exposure)
 
 
-def _searched(
+def search(
     seen: Detections,
     camera: Camera,
     model: BallModel,
     surfaces: Surfaces,
-    share: float,
-    play: bool,
-    watch: Watch,
-) -> tuple[Chosen, Field]:
-    """The likeliest strokes and the field in which they were found, with stamps since the first picture."""
+    seen_share: float = UNKNOWN,
+    *,
+    play: bool = False,
+    watch: Watch = unwatched,
+) -> tuple[Chosen, Field | None]:
+    """The likeliest strokes and the field in which they were found, with stamps since the first picture.
+
+    Args: as for `strokes_of`.  Returns: None as field of pictures of which too few have candidates for any stroke.
+    """
+    if len(np.unique(seen.frame)) < LEAST:
+        return NOTHING, None
     flat, pinhole = without_lens(replace(seen, frames=elapsed(seen.frames, float(seen.frames[0]))), camera)
     scale, fall = at_court(pinhole, surfaces)
-    seeds, plain, foretold = arcs(replace(Field.of(flat, scale, share, fall), play=play))
+    seeds, plain, foretold = arcs(replace(Field.of(flat, scale, seen_share, fall), play=play))
     density = foretold.density(np.zeros(0, dtype=np.int64))  # with the ball, which is not known yet
     chosen = NOTHING
     for _ in range(ROUNDS):

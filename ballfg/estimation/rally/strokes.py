@@ -40,7 +40,8 @@ CUT: Final = 12
 """Candidates at an end of a stroke that may belong to the next one, or to clutter: seen from behind a player, a flight
 goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
-"""m/s, of a stroke, along the court at least and in all at most; where any flight counts, or the court's ends are not known, no way is along it."""
+"""m/s, of a stroke, along the court at least and in all at most; where any flight counts, and where the court's ends
+are not known, no way is along it."""
 ROOM: Final = (3.6, 3.6, 5.0)
 """Half lengths and half widths of the court, and half widths above it, in which a ball is in play."""
 
