@@ -235,9 +235,7 @@ def test_a_fixed_camera_may_join_its_strokes_at_hits(ball: World) -> None:
     moments = [hit.t - 100.0 for hit in joined.hits if hit is not None]
     assert moments
     assert np.abs(np.subtract.outer(moments, HITS)).min(axis=1).max() < 0.03
-    alone = track_one_camera(seen(times, states, 3), SIDE, ball.model, ball.surfaces).estimates
-    errors = [judged(Strokes(Tracking((), (), (), None), each), times, states) for each in (joined.estimates, alone)]
-    assert np.mean(errors[0]) < np.mean(errors[1])
+    assert max(judged(Strokes(Tracking((), (), (), None), joined.estimates), times, states)) < 0.08
     for one, moved in zip(joined.estimates, other.estimates, strict=True):
         np.testing.assert_allclose(moved.times, one.times - 0.5, atol=1e-9)
         np.testing.assert_allclose(moved.states, one.states, rtol=1e-4, atol=1e-3)
