@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -204,7 +205,7 @@ def test_two_balls_may_fly_at_the_same_time(ball: World) -> None:
     late = seen(times, other, 4).select
     extra = late(np.isclose(seen(times, other, 4).scores, 0.9))
     order = np.argsort(np.append(both.frame, extra.frame), kind="stable")
-    joined = {
+    joined: dict[str, Any] = {
         name: np.concatenate((getattr(both, name), getattr(extra, name)))[order]
         for name in ("frame", "pixels", "covariances", "scores", "streaks")
     }

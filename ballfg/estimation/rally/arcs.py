@@ -67,7 +67,7 @@ class Foretold:
 
     def without(self, clutter: Mask) -> "Foretold":
         """What is left without the triples that hold one of some candidates (n,) bool."""
-        kept = ~clutter[np.array(self.rows, dtype=np.int64).reshape(-1, 3)].any(axis=1)
+        kept = np.asarray(~clutter[np.array(self.rows, dtype=np.int64).reshape(-1, 3)].any(axis=1))
         return Foretold(*([one for one, keep in zip(of, kept, strict=True) if keep] for of in vars(self).values()))
 
 
