@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from ballfg.dynamics import Surfaces
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation import Status
-from ballfg.estimation.one_camera import Strokes, _cut, track_one_camera
-from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.tracks.sightings import Sightings
+from ballfg.estimation.one_camera import Strokes, track_one_camera
+from ballfg.estimation.rally.arcs import BENT, CARRIED, MOSTLY, arcs, telling
+from ballfg.estimation.rally.field import FLATTEST, Field, at_court
+from ballfg.estimation.rally.reconstruct import strokes_of, without_lens
+from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Candidates, Detections
+from ballfg.vision.tracking.pipeline import Tracking
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
 
 RATE, NOISE = 50.0, 0.5
@@ -44,13 +49,13 @@ def rally(ball: World) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(times), np.concatenate(states)
 
 
-def seen(times: np.ndarray, states: np.ndarray, seed: int, hidden: float = 0.05) -> Detections:
+def seen(times: np.ndarray, states: np.ndarray, seed: int, hidden: float = 0.05, camera: Camera = SIDE) -> Detections:
     """The ball in most frames, two wrong candidates in each, and a light that glides through the picture."""
     rng, frames = np.random.default_rng(seed), []
     first = round(times[0] * RATE)
-    pixels = SIDE.project(states[:, :3]) + NOISE * rng.standard_normal((len(times), 2))
+    pixels = camera.project(states[:, :3]) + NOISE * rng.standard_normal((len(times), 2))
     for frame in range(first + len(times) + 20):
-        found, scores = [*rng.uniform((0, 0), SIDE.size, (2, 2))], [0.35, 0.4]
+        found, scores = [*rng.uniform((0, 0), camera.size, (2, 2))], [0.35, 0.4]
         found.append(np.array([100.0 + 3.0 * frame, 600.0]) + NOISE * rng.standard_normal(2))
         scores.append(0.5)
         if first <= frame < first + len(times) and rng.uniform() > hidden:
@@ -88,17 +93,6 @@ def test_a_rally_is_cut_at_its_hits(ball: World) -> None:
     assert strokes.tracking.seen(ball_one, 0).frames[0] == pytest.approx(HITS[0] * RATE, abs=5)
 
 
-def test_motion_that_is_smooth_through_hits_is_cut_there(ball: World) -> None:
-    """A chain of one piece that holds three strokes: flights stop explaining it at the hits, to three frames."""
-    times, states = rally(ball)
-    pixels = SIDE.project(states[:, :3]) + NOISE * np.random.default_rng(6).standard_normal((len(times), 2))
-    spread = np.tile(NOISE**2 * np.eye(2), (len(times), 1, 1))
-    whole = Sightings(("side",), np.zeros(len(times), dtype=np.int64), times, pixels, spread)
-    strokes = _cut([whole], SIDE, Smoother(ball.model, ball.surfaces))
-    assert [stroke.times[0] for stroke in strokes] == pytest.approx(HITS[:-1], abs=0.07)
-    assert sum(len(stroke) for stroke in strokes) == len(times)
-
-
 def test_what_does_not_fall_is_no_ball(ball: World) -> None:
     times, states = rally(ball)
     empty = seen(times, states, 4, hidden=1.1)
@@ -119,3 +113,131 @@ def test_of_a_time_shift_nothing_changes(ball: World) -> None:
         np.testing.assert_allclose(c.times, a.times - 0.5, atol=1e-9)
         np.testing.assert_allclose(b.states, a.states, rtol=1e-4, atol=1e-3)
         np.testing.assert_allclose(c.states, a.states, rtol=1e-4, atol=1e-3)
+
+
+def test_a_light_that_glides_is_no_evidence_of_a_ball_but_a_flight_is(ball: World) -> None:
+    times, states = rally(ball)
+    found, pinhole = without_lens(seen(times, states, 3), SIDE)
+    scale, fall = at_court(pinhole, ball.surfaces)
+    field = Field.of(found, scale, fall=fall)
+    seeds, rated, foretold = arcs(field)
+    light = np.isclose(found.scores, 0.5)
+    assert (rated.density[light] > field.density[light]).mean() > 0.95
+    assert (rated.density[light] * 2.0 * np.pi * np.sqrt(np.linalg.det(field.covariances[light]))).max() <= 1.0 + 1e-9
+    np.testing.assert_array_equal(rated.density[~light], field.density[~light])
+    assert not any(light[rows].mean() >= MOSTLY for rows in seeds)
+    assert not light[np.array(foretold.rows)].all(axis=1).any()
+    # it takes as long as gravity needs to show; along a line of sight it never does
+    assert telling(field) == pytest.approx((2.0 * BENT * 2.0 * np.sqrt(180.0) / (CARRIED * fall)) ** 0.5)
+    assert (arcs(replace(field, fall=0.0))[1].density == field.density).all()
+
+
+def test_gravity_shows_as_much_as_a_camera_sees_of_it(ball: World) -> None:
+    _, pinhole = without_lens(Detections.of_frames("side", [(0.0, Candidates.none())]), SIDE)
+    scale, fall = at_court(pinhole, ball.surfaces)
+    drop = pinhole.project(np.array([[0.0, 0.0, TABLE], [0.0, 0.0, TABLE - 0.01]]))
+    assert fall == pytest.approx(9.80665 * 100.0 * np.linalg.norm(drop[1] - drop[0]), rel=0.02)
+    assert scale == pytest.approx(1000.0 / np.linalg.norm(SIDE.centre - [0.0, 0.0, TABLE]))
+    down = replace(pinhole, rvec=np.array([np.pi, 0.0, 0.0]), tvec=np.array([0.0, 0.0, 4.0]))
+    assert at_court(down, ball.surfaces)[1] == pytest.approx(0.0, abs=1e-9)
+    # without ends it is where the middle of the picture shows the ground, but not beyond some times the height
+    endless = Surfaces(TABLE)
+    assert at_court(down, endless)[0] == pytest.approx(1000.0 / (4.0 - TABLE))
+    level = replace(pinhole, rvec=np.array([np.pi / 2.0, 0.0, 0.0]), tvec=np.array([0.0, TABLE + 3.0, 0.0]))
+    assert level.centre[2] == pytest.approx(TABLE + 3.0)
+    assert at_court(level, endless)[0] == pytest.approx(1000.0 * FLATTEST / 3.0)
+
+
+def test_a_lens_with_distortion_and_two_focal_lengths_is_undone(ball: World) -> None:
+    times, states = rally(ball)
+    matrix = np.array([[1100.0, 0.0, 650.0], [0.0, 900.0, 350.0], [0.0, 0.0, 1.0]])
+    wide = replace(SIDE, matrix=matrix, distortion=np.array([-0.25, 0.05, 0.001, 0.0, 0.0]))
+    found = seen(times, states, 3, camera=wide)
+    flat, pinhole = without_lens(found, wide)
+    points = states[:, :3]
+    focal = np.sqrt(1100.0 * 900.0)
+    np.testing.assert_allclose(np.diag(pinhole.matrix)[:2], focal)
+    balls = flat.pixels[np.isclose(found.scores, 0.9)]
+    off = np.linalg.norm(balls[:, None] - pinhole.project(points), axis=2).min(axis=1)
+    assert np.median(off) < 2.0 * NOISE
+    # a small step in the picture has the length that its covariance says
+    (one, *_), step = found.pixels, np.array([0.1, 0.05])
+    both = Detections.of_frames("side", [(0.0, Candidates.at([one, one + step], 1.0))])
+    undone, _ = without_lens(both, wide)
+    moved = undone.pixels[1] - undone.pixels[0]
+    assert moved @ np.linalg.inv(undone.covariances[0]) @ moved == pytest.approx(step @ step, rel=1e-3)
+    assert without_lens(flat, pinhole) == (flat, pinhole)
+    strokes = track_one_camera(found, wide, ball.model, ball.surfaces)
+    assert len(strokes.estimates) == 3
+    assert max(judged(strokes, times, states)) < 0.08
+
+
+def test_a_court_needs_no_ends(ball: World) -> None:
+    times, states = rally(ball)
+    for ends in (None, (-np.inf, np.inf, -np.inf, np.inf)):
+        strokes = track_one_camera(seen(times, states, 3), SIDE, ball.model, replace(ball.surfaces, extent=ends))
+        assert len(strokes.estimates) == 3
+        assert max(judged(strokes, times, states)) < 0.08
+
+
+def test_a_single_flight_without_a_bounce_is_a_stroke(ball: World) -> None:
+    start = np.array([-1.0, -0.2, TABLE + 0.1, 1.8, 0.1, 3.2, 0.0, 0.0, 0.0])
+    times = np.arange(1, 31) / RATE
+    with torch.no_grad():
+        path = rollout(
+            ball.model, torch.from_numpy(start[None]), torch.from_numpy(np.append(0.0, times)), ball.surfaces
+        )
+    states = path[0, 1:].numpy()
+    for surfaces in (ball.surfaces, replace(ball.surfaces, extent=None)):
+        (estimate,) = track_one_camera(seen(times, states, 3), SIDE, ball.model, surfaces).estimates
+        assert not estimate.contacts
+        assert len(estimate) >= 25
+        assert estimate.status in (Status.OK, Status.DEPTH_UNCERTAIN)
+        rows = np.searchsorted(times, estimate.times - 100.0 - 1e-6)
+        off = np.linalg.norm(estimate.states[:, :3] - states[rows, :3], axis=1)
+        assert np.median(off) < 3.0 * float(np.sqrt(np.trace(estimate.covariances[15, :3, :3])))
+
+
+def test_two_balls_may_fly_at_the_same_time(ball: World) -> None:
+    times, states = rally(ball)
+    both = seen(times, states, 3)
+    other = states * np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+    late = seen(times, other, 4).select
+    extra = late(np.isclose(seen(times, other, 4).scores, 0.9))
+    order = np.argsort(np.append(both.frame, extra.frame), kind="stable")
+    joined: dict[str, Any] = {
+        name: np.concatenate((getattr(both, name), getattr(extra, name)))[order]
+        for name in ("frame", "pixels", "covariances", "scores", "streaks")
+    }
+    strokes = track_one_camera(replace(both, **joined), SIDE, ball.model, ball.surfaces)
+    assert len(strokes.estimates) == 6
+    errors = np.minimum(judged(strokes, times, states), judged(strokes, times, other))
+    assert errors.max() < 0.08
+    starts = [estimate.times[0] for estimate in strokes.estimates]
+    assert starts == sorted(starts)
+
+
+def test_a_recording_without_a_ball_has_no_strokes(ball: World) -> None:
+    rng = np.random.default_rng(7)
+    one = Candidates.at(rng.uniform((0, 0), SIDE.size, (2, 2)), NOISE)
+    for count in (1, 40):
+        for candidates in (Candidates.none(), one):
+            found = Detections.of_frames("side", [(1.7e9 + frame / RATE, candidates) for frame in range(count)])
+            strokes = track_one_camera(found, SIDE, ball.model, ball.surfaces)
+            assert strokes.estimates == ()
+            assert strokes.tracking.balls == ()
+            assert strokes.doubts == []
+
+
+def test_a_fixed_camera_may_join_its_strokes_at_hits(ball: World) -> None:
+    times, states = rally(ball)
+    late = replace(SIDE, time_offset=0.5)
+    joined, other = (strokes_of(seen(times, states, 3), camera, ball.model, ball.surfaces) for camera in (SIDE, late))
+    moments = [hit.t - 100.0 for hit in joined.hits if hit is not None]
+    assert moments
+    assert np.abs(np.subtract.outer(moments, HITS)).min(axis=1).max() < 0.03
+    assert max(judged(Strokes(Tracking((), (), (), None), joined.estimates), times, states)) < 0.08
+    for one, moved in zip(joined.estimates, other.estimates, strict=True):
+        np.testing.assert_allclose(moved.times, one.times - 0.5, atol=1e-9)
+        np.testing.assert_allclose(moved.states, one.states, rtol=1e-4, atol=1e-3)
+        assert [contact.interval for contact in moved.contacts] == [contact.interval for contact in one.contacts]

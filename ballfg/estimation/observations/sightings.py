@@ -322,7 +322,9 @@ def sighted_track(
     seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)), alone)
     if known is not None:
         seen.place = place_prior(ground)
-        seen.known = Segmentation.of_contacts(known.contacts(moments), len(moments))
+        since = moments - moments[0]  # as an estimator counts the stamps of a track: a time offset moves all of them
+        known = replace(known, bounces=tuple((np.array(known.bounces) - moments[0]).tolist()))
+        seen.known = Segmentation.of_contacts(known.contacts(since), len(moments))
     stamps = written(moments, origin)
     return Track(stamps, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True, name=name)
 

@@ -2,7 +2,8 @@
 
 Three candidates whose second difference a ball may have begin an arc; it goes on to both sides where a parabola through
 its last points meets a candidate. Over pictures without the ball arcs begin with the likeliest candidates only, and
-bars must agree with the motion.
+bars must agree with the motion. What goes on in a straight line at a steady speed for longer than gravity lets a ball
+do so is clutter.
 """
 
 import math
@@ -39,6 +40,12 @@ LIKELIEST: Final = 24
 """Candidates of a picture with which an arc begins over pictures without the ball."""
 AGREE: Final = 3.0
 """Standard deviations of a bar about its motion."""
+BENT: Final = 3.0
+"""Noises, root mean square, by which gravity bends a flight that is told from a straight line."""
+CARRIED: Final = 1.0 / 3.0
+"""Least share of gravity that bends a flight: the lift of much backspin carries the rest."""
+MOSTLY: Final = 0.5
+"""Share of straight candidates from which on an arc is no seed of a flight."""
 EXPOSURES: Final = np.linspace(0.0, 1.0, 41)
 """Of the step, that are tried."""
 FLAGS: Final[Any] = types.Array(types.boolean, 2, "C")
@@ -57,6 +64,44 @@ class Foretold:
         clutter = ~np.isin(np.array(self.rows).reshape(-1, 3), ball).any(axis=1)
         area = float(np.array(self.area)[clutter].sum())
         return (float(np.array(self.met)[clutter].sum()) + 1.0) / area if area else 0.0
+
+    def without(self, clutter: Mask) -> "Foretold":
+        """What is left without the triples that hold one of some candidates (n,) bool."""
+        kept = np.asarray(~clutter[np.array(self.rows, dtype=np.int64).reshape(-1, 3)].any(axis=1))
+        return Foretold(*([one for one, keep in zip(of, kept, strict=True) if keep] for of in vars(self).values()))
+
+
+def telling(field: Field) -> float:
+    """s, for which a ball flies until gravity has bent its flight by clearly more than noise.
+
+    The second integral of an acceleration a over a time T misses its best straight line by a T^2 / (2 sqrt(180)), root
+    mean square.
+    """
+    return float(np.sqrt(BENT * NOISE * 2.0 * np.sqrt(180.0) / (CARRIED * field.fall))) if field.fall else np.inf
+
+
+def straight(field: Field, found: Sequence[Index]) -> Mask:
+    """(n,) True for candidates of arcs that are straight and steady for longer than gravity lets a ball be so.
+
+    Such a motion (a light, a shadow, somebody who walks by) foretells its candidates as exactly as a flight does, and a
+    flight through it would explain nothing. Long arcs are looked at in parts.
+    """
+    among, longest = np.zeros(len(field.frame), dtype=bool), telling(field)
+    for rows in found:
+        since = field.stamps[field.frame[rows]] - field.stamps[field.frame[rows[0]]]
+        parts = int(since[-1] / longest)
+        ends = np.searchsorted(since, np.arange(1, parts) * since[-1] / parts) if parts else ()
+        for part in np.split(rows, ends) if parts else ():
+            among[part] |= len(part) >= LEAST and _steady(field, part)
+    return among
+
+
+def _steady(field: Field, rows: Index) -> bool:
+    """True for candidates that differ from a straight and steady motion by noise alone."""
+    since = field.stamps[field.frame[rows]]
+    steady = np.stack((np.ones(len(rows)), since - since.mean()), axis=1)
+    off = field.pixels[rows] - steady @ np.linalg.lstsq(steady, field.pixels[rows], rcond=None)[0]
+    return bool(np.sqrt((off**2).sum(axis=1).mean()) < NOISE)
 
 
 def with_exposure(field: Field, found: Sequence[Index]) -> Field:
@@ -89,7 +134,8 @@ def _likeliest(gain, first, last, order, frames):
 def arcs(field: Field) -> tuple[list[Index], Field, Foretold]:
     """Numbers of the candidates of each arc, in order of time, longest arcs first; arcs may share candidates.
 
-    Returns: the arcs, the field with the exposure that they show, and how often they foretell candidates.
+    Returns: the arcs, the field with the exposure that they show, in which straight motions are no evidence of a ball,
+    and how often other arcs foretell candidates.
     """
     tally, frames = Foretold([], [], []), len(field.first) - 1
     widest = max((field.first[min(k + 1 + APART, frames)] - field.first[k + 1] for k in range(frames)), default=0)
@@ -102,7 +148,9 @@ def arcs(field: Field) -> tuple[list[Index], Field, Foretold]:
     likeliest = [rows[np.argsort(field.density[rows], kind="stable")[:LIKELIEST]] for rows in every]
     found += _begun(field, likeliest, range(1, APART + 1), used, tally)
     found = [rows for rows in found if len(rows) >= LEAST or field.agree(rows, AGREE)]
-    return sorted(found, key=lambda rows: -len(rows)), field, tally
+    clutter = straight(field, found)
+    found = [rows for rows in found if clutter[rows].mean() < MOSTLY]
+    return sorted(found, key=lambda rows: -len(rows)), field.without(clutter), tally.without(clutter)
 
 
 def _begun(field: Field, rows_of: Sequence[Index], gaps: Sequence[int], used: Mask, tally: Foretold) -> list[Index]:

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.estimation.rally.arcs import telling
 from ballfg.estimation.rally.hits import Hits
 from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.parallel.parts import in_parts
@@ -103,7 +104,38 @@ def rally(grower: Grower, seeds: Sequence[Index], earlier: Sequence[Stroke] = ()
                 known[_key(better)] = better
         if not fresh and not new:
             break
-    return best_sequence(grower, hits, list(known.values()))
+    chosen = best_sequence(grower, hits, list(known.values()))
+    return chosen if grower.field.play else with_others(grower, chosen, list(known.values()))
+
+
+def with_others(grower: Grower, chosen: Chosen, strokes: Sequence[Stroke]) -> Chosen:
+    """The strokes of a sequence, and after them those of other balls that fly meanwhile: they share no candidates.
+
+    One that is likelier than all with which it shares candidates takes their place: a sequence cuts a stroke where that
+    of another ball begins.
+    """
+    kept, holder = dict(enumerate(chosen.strokes)), dict[int, int]()
+    holder.update((row, number) for number, one in kept.items() for row in one.rows.tolist())
+    chances = dict(enumerate(chosen.probabilities.tolist()))
+    for one in sorted(strokes, key=lambda stroke: -stroke.score):
+        rivals = {holder[row] for row in one.rows.tolist() if row in holder}
+        gain = one.score - BEGINS - sum(kept[number].score for number in rivals)
+        if gain > GAINED and _shown(grower, one):
+            number = len(chosen.strokes) + len(chances)
+            for rival in rivals:
+                for row in kept.pop(rival).rows.tolist():
+                    del holder[row]
+            kept[number], chances[number] = one, float(1.0 / (1.0 + np.exp(-gain)))
+            holder.update((row, number) for row in one.rows.tolist())
+    joined = [number < len(chosen.joined) and chosen.joined[number] and number - 1 in kept for number in kept]
+    return Chosen(tuple(kept.values()), np.array([chances[number] for number in kept]), tuple(joined))
+
+
+def _shown(grower: Grower, stroke: Stroke) -> bool:
+    """True if a stroke without a hit is a ball's: it bounces or, where any flight counts, shows how it falls."""
+    field = grower.field
+    first, last = field.stamps[field.frame[stroke.rows[[0, -1]]]]
+    return stroke.path.bounces > 0 or (not field.play and last - first >= telling(field))
 
 
 def _open_ends(chosen: Chosen) -> list[tuple[Stroke, int]]:
@@ -191,7 +223,7 @@ def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chos
         return Chosen((), np.zeros(0), ())
     first, last = (grower.field.frame[[one.rows[end] for one in ordered]] for end in (0, -1))
     score = np.array([one.score for one in ordered])
-    begins = np.where([one.path.bounces > 0 for one in ordered], -BEGINS, -np.inf)  # else it may be anything
+    begins = np.where([_shown(grower, one) for one in ordered], -BEGINS, -np.inf)  # else it may be anything
     later = first > last[:, None]
     soon = grower.field.stamps[first] - grower.field.stamps[last][:, None] < PAUSE
     # without a hit between them a ball in play was there unseen, or a new rally began at once

@@ -10,6 +10,9 @@ from numba import types
 from ballfg.arrays import Array, Index, Mask, plain
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNTS, FLAG, NOTHING, ONE, REAL, TWO, several
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.state import STANDARD_GRAVITY
+from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
 SEEN, UNKNOWN = 0.9, 0.5
@@ -27,6 +30,34 @@ ASKEW: Final = 0.5
 """rad between a bar and the motion of its centre."""
 LONG: Final = 8.0
 """px of a bar and of a motion whose directions are compared."""
+HELD, FLATTEST = 1.5, 1.0 / 6.0
+"""m above a court without known ends, at which a camera stands at least, and sine of the flattest angle at which it
+looks down there: one that looks at the horizon would see all balls far away."""
+
+
+def ends_of(surfaces: Surfaces) -> Array | None:
+    """((x_low, x_high), (y_low, y_high)) m of a court; None if one of its ends is not known."""
+    if surfaces.extent is None or not np.isfinite(surfaces.extent).all():
+        return None
+    return np.array(surfaces.extent).reshape(2, 2)
+
+
+def at_court(camera: Camera, surfaces: Surfaces) -> tuple[float, float]:
+    """Pixels for a m at the court's middle, and px/s^2 of a free fall there, both across a camera's line of sight.
+
+    Of a court without known ends the place counts that the middle of the picture shows.
+
+    Args: camera: without distortion and with one focal length.
+    """
+    ends, focal = ends_of(surfaces), float(camera.matrix[0, 0])
+    if ends is None:
+        away = camera.rotation[2]
+        away = away * max(camera.centre[2] - surfaces.table_height, HELD) / max(-away[2], FLATTEST)
+    else:
+        away = np.append(ends.mean(axis=1), surfaces.table_height) - camera.centre
+    distance = float(np.linalg.norm(away))
+    across = float(np.hypot(away[0], away[1])) / distance  # sine of the angle from the vertical
+    return focal / distance, focal / distance * across * STANDARD_GRAVITY
 
 
 @machine_code(several(REAL, 2)(REAL, REAL, REAL, REAL))
@@ -99,6 +130,8 @@ class Field:
         first: (f + 1,) where each picture's begin.  stamps: (f,) s, of the pictures.  step: s between them, the median.
         scale: px for a m at the court.  exposure: of the step, during which the shutter is open.
         seen: probability that the ball is among the candidates of a picture.
+        fall: px/s^2, of a free fall at the court; 0 along the line of sight.
+        play: True if one ball in play is looked for, which flies along the court and bounces; False for any flight.
     """
 
     frame: Index
@@ -113,9 +146,11 @@ class Field:
     scale: float
     exposure: float = 0.0
     seen: float = SEEN
+    fall: float = 0.0
+    play: bool = True
 
     @classmethod
-    def of(cls, seen: Detections, scale: float, ball: float = SEEN) -> "Field":
+    def of(cls, seen: Detections, scale: float, ball: float = SEEN, fall: float = 0.0) -> "Field":
         """The field of detections of a fixed camera that hold the ball with a probability `ball`."""
         count, pixels = len(seen.frames), seen.pixels
         size = pixels.max(axis=0, initial=-np.inf) - pixels.min(axis=0, initial=np.inf)
@@ -127,11 +162,16 @@ class Field:
         share = (np.bincount(number) + 1.0) / (len(bars) + number.max(initial=0) + 1.0)
         usual = share[number] / (np.pi * RING**2 * (2.0 * number + 1.0))  # of rings about a bar of no length
         rows = plain(seen.frame), plain(pixels), plain(seen.covariances), bars, density, usual * bars.any()
-        return cls(*rows, first, seen.frames, step, scale, seen=ball)
+        return cls(*rows, first, seen.frames, step, scale, seen=ball, fall=fall)
 
     def smooth(self, density: float) -> "Field":
         """The field whose clutter moves smoothly: where its motion foretells a candidate, it has a density, 1/px^2."""
         return replace(self, density=np.maximum(self.density, density))
+
+    def without(self, clutter: Mask) -> "Field":
+        """The field in which some candidates (n,) are as dense as their noise: to be where a motion foretells them."""
+        own = 1.0 / (2.0 * np.pi * np.sqrt(np.linalg.det(self.covariances)))
+        return replace(self, density=np.where(clutter, np.maximum(own, self.density), self.density))
 
     def rows(self, frame: int) -> Index:
         """Numbers of the candidates of a picture; none beyond the ends."""

@@ -51,7 +51,7 @@ VIEW: Final = np.dtype(
         ("net", np.float64),
     ]
 )
-"""The camera, which has no distortion; numbers of `Field`; m, x of the court's middle."""
+"""The camera, which has no distortion; numbers of `Field`; m, x of the court's middle, NaN where it has no ends."""
 CANDIDATES: Final[Any] = from_dtype(CANDIDATE)[::1]
 VIEWED: Final[Any] = from_dtype(VIEW)
 
@@ -127,6 +127,8 @@ def _gain(rays, candidates, scene, view, rows, times, bounces, path):
 @machine_code(REAL(SCENE, VIEWED, ONE, COUNT, FLOWN))
 def halves(scene, view, times, bounces, path):
     """Logarithm of what the halves of the court cost on which a path bounces, as well as these are known."""
+    if math.isnan(view.net):
+        return 0.0
     cost, share, at, spread = 0.0, np.empty(len(path.vectors)), np.empty(3), np.empty((3, 3))
     for bounce in range(bounces):
         drop = share_at(times[bounce], times, bounces, path.drag, scene.gravity, share)

@@ -1,4 +1,4 @@
-"""Reconstructs the strokes of a shot: candidates as a fixed camera would see them, strokes, estimates and events."""
+"""Reconstructs the strokes that one camera saw, a moving one as a fixed one would see them: strokes and estimates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,23 +6,24 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Mask
+from ballfg.arrays import Array, Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.noise.sightings import Noise, settled
 from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
-from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, Field
+from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, UNKNOWN, Field, at_court
 from ballfg.estimation.rally.joined import joined_estimates
 from ballfg.estimation.rally.moments import Event
-from ballfg.estimation.rally.strokes import Grower, Stroke
+from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Track
 from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
@@ -39,15 +40,18 @@ ROUNDS, SETTLED = 3, 0.1
 """In which the probability to see the ball is found, and its change that ends them."""
 THINNER: Final = 3.0
 """Ratio of the densities of smooth clutter with and without the ball, above which another round follows."""
+NOTHING: Final = Chosen((), np.zeros(0), ())
+"""No stroke."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShotRally:
-    """The strokes of a shot.
+    """The strokes of a shot, or of a fixed camera's recording.
 
     Attributes:
         camera: fixed, at the shot's place, with the covariance of its turn, place and focal length.
-        seen: the candidates as that camera sees them.  chosen: strokes with their probabilities.
+        seen: the candidates as that camera sees them, with the noise that the strokes show.
+        chosen: strokes with their probabilities; they count time from the first picture.
         estimates: of each stroke, in the same order, joined at hits.
         hits: at the begin of each, None where it follows none.  exposure: of the time between pictures.
     """
@@ -83,6 +87,23 @@ def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> 
     return replace(found, camera=name, pixels=np.nan_to_num(pixels), covariances=spread, streaks=streaks).select(seen)
 
 
+def without_lens(seen: Detections, camera: Camera) -> tuple[Detections, Camera]:
+    """The candidates as a camera without distortion and with one focal length would see them, and that camera."""
+    (fx, fy), middle = np.diag(camera.matrix)[:2], camera.matrix[:2, 2]
+    if fx == fy and not camera.distortion.any():
+        return seen, camera
+    focal = float(np.sqrt(fx * fy))
+
+    def onto(pixels: Array) -> Array:
+        return focal * camera.normalized(pixels) + middle
+
+    slope = np.stack([onto(seen.pixels + step) - onto(seen.pixels - step) for step in 0.5 * np.eye(2)], axis=-1)
+    spread = slope @ seen.covariances @ slope.swapaxes(1, 2)
+    flat = replace(seen, pixels=onto(seen.pixels), covariances=spread, streaks=onto(seen.streaks))
+    matrix = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
+    return flat, replace(camera, matrix=matrix, distortion=np.zeros(0))
+
+
 def reconstruct(
     found: Detections,
     shot: Shot,
@@ -93,37 +114,45 @@ def reconstruct(
     seen_share: float = SEEN,
     watch: Watch = unwatched,
 ) -> ShotRally:
-    """The strokes of a shot, with the estimate of each.
+    """The strokes of a shot of a moving camera, with the estimate of each.
 
-    Args:
-        found: candidates in the pictures of the shot.  model: the ball.  surfaces: with the court's ends.
-        first: number of the first stroke; strokes are named by three digits.
-        seen_share: probability that the ball is among the candidates of a picture, at first.
+    Args: found: candidates in the pictures of the shot; others as for `strokes_of`.
     """
     name = f"shot{shot.first}"
     pinhole, camera = fixed_camera(shot, name)
     seen = on_fixed_camera(found, shot, pinhole, name)
-    field = Field.of(seen, pinhole.focal / float(np.linalg.norm(pinhole.place)), seen_share)
-    seeds, plain, foretold = arcs(field)
-    density = foretold.density(np.zeros(0, dtype=np.int64))  # with the ball, which is not known yet
-    chosen = Chosen((), np.zeros(0), ())
-    for _ in range(ROUNDS):
-        field = plain.smooth(density)
-        grower = Grower.of(field, seen.times, camera, physics_of(model), surfaces)
-        chosen = rally(grower, seeds, chosen.strokes, watch)
-        if not chosen.strokes:
-            break
-        plain, before = replace(plain, seen=_seen_share(field, chosen)), density
-        density = foretold.density(np.concatenate([stroke.rows for stroke in chosen.strokes]))
-        if abs(plain.seen - field.seen) < SETTLED and before < THINNER * density:
-            break
+    return strokes_of(seen, camera, model, surfaces, first=first, seen_share=seen_share, play=True, watch=watch)
+
+
+def strokes_of(
+    seen: Detections,
+    camera: Camera,
+    model: BallModel,
+    surfaces: Surfaces,
+    *,
+    first: int = 0,
+    seen_share: float = UNKNOWN,
+    play: bool = False,
+    watch: Watch = unwatched,
+) -> ShotRally:
+    """The strokes that a fixed camera saw, with the estimate of each.
+
+    Args:
+        seen: its candidates.  model: the ball.  surfaces: with the court's ends, if they are known.
+        first: number of the first stroke; strokes are named by three digits.
+        seen_share: probability that the ball is among the candidates of a picture, at first.
+        play: True for one ball in play, as `Field` has it; False for all flights, of several balls too.
+    """
+    chosen, field = search(seen, camera, model, surfaces, seen_share, play=play, watch=watch)
+    if field is None:
+        return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
-    kinked = _kinked(seen, chosen, field)
+    kinked = _kinked(chosen, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None), chosen, kinked)
     seen = _with_noise(seen, noise, kinked)
     tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
     alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
-    begun, end = _in_play(alone)
+    begun, end = _in_play(alone) if play else (0, len(alone))
     joined = (False, *chosen.joined[begun + 1 : end])
     estimates, hits = joined_estimates(smoother, tracks[begun:end], alone[begun:end], joined, field.step)
     named = [replace(one, name=f"{first + number:03d}") for number, one in enumerate(estimates)]
@@ -131,11 +160,45 @@ def reconstruct(
     return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), tuple(hits), field.exposure)
 
 
-def _kinked(seen: Detections, chosen: Chosen, field: Field) -> Mask:
+def search(
+    seen: Detections,
+    camera: Camera,
+    model: BallModel,
+    surfaces: Surfaces,
+    seen_share: float = UNKNOWN,
+    *,
+    play: bool = False,
+    watch: Watch = unwatched,
+) -> tuple[Chosen, Field | None]:
+    """The likeliest strokes and the field in which they were found, with stamps since the first picture.
+
+    Args: as for `strokes_of`.  Returns: None as field of pictures of which too few have candidates for any stroke.
+    """
+    if len(np.unique(seen.frame)) < LEAST:
+        return NOTHING, None
+    flat, pinhole = without_lens(replace(seen, frames=elapsed(seen.frames, float(seen.frames[0]))), camera)
+    scale, fall = at_court(pinhole, surfaces)
+    seeds, plain, foretold = arcs(replace(Field.of(flat, scale, seen_share, fall), play=play))
+    density = foretold.density(np.zeros(0, dtype=np.int64))  # with the ball, which is not known yet
+    chosen = NOTHING
+    for _ in range(ROUNDS):
+        field = plain.smooth(density)
+        grower = Grower.of(field, flat.times, pinhole, physics_of(model), surfaces)
+        chosen = rally(grower, seeds, chosen.strokes, watch)
+        if not chosen.strokes:
+            break
+        plain, before = replace(plain, seen=_seen_share(field, chosen)), density
+        density = foretold.density(np.concatenate([stroke.rows for stroke in chosen.strokes]))
+        if abs(plain.seen - field.seen) < SETTLED and before < THINNER * density:
+            break
+    return chosen, field
+
+
+def _kinked(chosen: Chosen, field: Field) -> Mask:
     """(n,) True for the chosen candidates in whose bars the ball bounced."""
-    kinked, half = np.zeros(len(seen), dtype=bool), 0.5 * field.exposure * field.step
+    kinked, half = np.zeros(len(field.frame), dtype=bool), 0.5 * field.exposure * field.step
     for stroke in chosen.strokes:
-        apart = np.abs(seen.times[stroke.rows][:, None] - np.array(stroke.bounces))
+        apart = np.abs(field.stamps[field.frame[stroke.rows]][:, None] - np.array(stroke.bounces))
         kinked[stroke.rows] = (apart < half).any(axis=1)
     return kinked
 
@@ -165,7 +228,7 @@ def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, s
     """A stroke as a track of sightings with known bounces."""
     rows = stroke.rows
     parts = np.zeros(len(rows), dtype=np.int64), seen.times[rows], seen.pixels[rows], seen.covariances[rows]
-    bounces = np.array(stroke.bounces)
+    bounces = written(stroke.bounces, float(seen.frames[0])) - camera.time_offset
     sightings = Sightings((camera.name,), *parts)
     return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)
 

@@ -16,7 +16,7 @@ from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, possible, shares_of, solved
 from ballfg.estimation.observations.ray_path import Rays
-from ballfg.estimation.rally.field import Field
+from ballfg.estimation.rally.field import Field, ends_of
 from ballfg.estimation.rally.growth import CANDIDATE, VIEW, all_rated, filled, grown, rated
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
@@ -34,11 +34,14 @@ LEAST: Final = 4
 """Candidates of a shortened stroke."""
 BETWEEN: Final = 0.1
 """s between two bounces of a service, at least: a ball that rests longer on the court is not in play."""
+APART: Final = 1e-6
+"""s, at least, between a bounce and the first and the last candidate: at one of them it is seen from one side alone."""
 CUT: Final = 12
 """Candidates at an end of a stroke that may belong to the next one, or to clutter: seen from behind a player, a flight
 goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
-"""m/s, of a stroke, along the court at least and in all at most."""
+"""m/s, of a stroke, along the court at least and in all at most; where any flight counts, and where the court's ends
+are not known, no way is along it."""
 ROOM: Final = (3.6, 3.6, 5.0)
 """Half lengths and half widths of the court, and half widths above it, in which a ball is in play."""
 
@@ -87,7 +90,8 @@ class Grower:
         own = (field.frame, field.pixels, field.covariances, field.bars, field.usual, field.spot)
         for name, values in zip(CANDIDATE.names or (), own, strict=True):
             found[name] = values
-        net = float(np.mean((self.scene.surfaces.extent or (0.0, 0.0))[:2]))
+        ends = ends_of(self.scene.surfaces)
+        net = np.nan if ends is None else float(ends[0].mean())
         lens = (camera.rotation, camera.tvec, camera.matrix[0, 0], camera.matrix[:2, 2])
         view = np.array([(*lens, field.step, field.seen, field.exposure, net)], dtype=VIEW)[0]
         return self.scene.sightings, found, self.scene.numbers, view
@@ -124,19 +128,22 @@ class Grower:
         return positions, np.asarray(np.einsum("na,aibj,nb->nij", share, joint, share))
 
     def plausible(self, stroke: Stroke) -> bool:
-        """True for a ball in play: its speed, its place, and its bounces on the court, seen on both sides."""
+        """True for a ball in play: its speed, its place at a court with known ends, its bounces, seen on both sides."""
         times = self.scene.rays.times[stroke.rows]
-        if stroke.bounces and not times[0] < stroke.bounces[0] <= stroke.bounces[-1] < times[-1]:
+        if stroke.bounces and not times[0] + APART < stroke.bounces[0] <= stroke.bounces[-1] < times[-1] - APART:
             return False
         if stroke.bounces and not possible(self.scene, stroke.path)[0]:
             return False
         if (np.diff(stroke.bounces) < BETWEEN).any():
             return False
-        velocities = stroke.path.vectors[0, 1 : stroke.path.bounces + 2]
-        if not (np.abs(velocities[:, 0]).max() > SPEEDS[0] and np.linalg.norm(velocities, axis=1).max() < SPEEDS[1]):
+        velocities, ends = stroke.path.vectors[0, 1 : stroke.path.bounces + 2], ends_of(self.scene.surfaces)
+        fastest = float(np.linalg.norm(velocities, axis=1).max())
+        along = np.abs(velocities[:, 0]).max() if self.field.play and ends is not None else fastest
+        if not (along > SPEEDS[0] and fastest < SPEEDS[1]):
             return False
+        if ends is None:
+            return True
         positions, spread = self.places_of(stroke.path, times)
-        ends = np.array(self.scene.surfaces.extent).reshape(2, 2)
         half, middle = 0.5 * (ends[:, 1] - ends[:, 0]), ends.mean(axis=1)
         floor = -half[1] if self.scene.surfaces.floor_height is None else self.scene.surfaces.floor_height
         low = np.append(middle - half * ROOM[:2], floor)

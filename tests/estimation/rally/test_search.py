@@ -153,7 +153,7 @@ def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed
     first[5:] = first[:2] + 1  # so that two are like earlier ones
     last = first + rng.integers(3, 9, count)
     frame, stamps = np.arange(50), 0.04 * np.arange(50)
-    grower: Any = SimpleNamespace(field=SimpleNamespace(frame=frame, stamps=stamps, seen=0.6 + 0.05 * seed))
+    grower: Any = SimpleNamespace(field=SimpleNamespace(frame=frame, stamps=stamps, seen=0.6 + 0.05 * seed, play=True))
     table = rng.normal(0.0, 6.0, (count, count))
     strokes: list[Any] = [
         SimpleNamespace(
