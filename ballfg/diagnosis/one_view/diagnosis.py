@@ -98,7 +98,7 @@ def told(
     """
     named = _named(found, name_at)
     plain, best, fitted = found.weights.weighed(()), found.weights.weighed(named), found.weights.fitted(named)
-    before, after = with_values(declared, found.first.strengths), _model(found, declared, fitted, named)
+    before, after = with_values(declared, found.first), _model(declared, fitted, named)
     was = predicted(before, Picture())
     now = predicted(after, Picture.of(fitted.strengths)) if named else was
     left, findings = _left(found, plain, best), tuple(_finding(found, one, best, fitted) for one in named)
@@ -120,7 +120,7 @@ def told(
         after=now,
         tracks_found_on=count,
         tracks_judged_on=len(was.by_track),
-        calibrated=_calibrated(found, fitted, declared),
+        calibrated=_calibrated(found.with_lift, declared),
         noise={},
         unexplained=left,
         model=after,
@@ -141,8 +141,8 @@ def _named(found: Found, name_at: float) -> list[Hypothesis]:
     return [h for h in chosen if odds.together(h.name, names) >= name_at]
 
 
-def _model(found: Found, declared: AnalyticModel, one: Set, named: Sequence[Hypothesis]) -> AnalyticModel:
-    """The declared model with a set's values and the lift, and with the effects of those named that act on the ball."""
+def _model(declared: AnalyticModel, one: Set, named: Sequence[Hypothesis]) -> AnalyticModel:
+    """The declared model with a set's values, and with the effects of those named that act on the ball."""
     values, sigmas = one.strengths, dict(zip(one.unknown, one.sigmas.tolist(), strict=True))
     added = []
     for hypothesis in named:
@@ -151,7 +151,7 @@ def _model(found: Found, declared: AnalyticModel, one: Set, named: Sequence[Hypo
             effect = hypothesis.effect(**{**hypothesis.shape, **{name: values[full] for name, full in names.items()}})
             effect.set_sigmas(**{name: sigmas[full] for name, full in names.items()})
             added.append(effect)
-    return with_values(declared, found.first.strengths | values, added)
+    return with_values(declared, values, added)
 
 
 def with_values(declared: AnalyticModel, values: Mapping[str, float], added: Sequence[Effect] = ()) -> AnalyticModel:
@@ -229,15 +229,11 @@ def _left(found: Found, plain: Set, best: Set) -> Unexplained:
     )
 
 
-def _calibrated(found: Found, best: Set, declared: AnalyticModel) -> Mapping[str, Value]:
-    """The declared coefficients of a set, and the lift as it was fitted without effects."""
+def _calibrated(one: Set, declared: AnalyticModel) -> Mapping[str, Value]:
+    """The coefficients of a set, as its strokes show them together."""
     given, units = dict(declared.named_parameters()), declared.declared_coefficients()
-    known = {
-        name: (float(value), float(sigma))
-        for one in (found.first, best)
-        for name, value, sigma in zip(one.unknown, one.values, one.sigmas, strict=True)
-    }
-    return {name: Value(*known[name], units[name].unit, float(given[name].detach())) for name in found.first.unknown}
+    values = zip(one.unknown, one.values.tolist(), one.sigmas.tolist(), strict=True)
+    return {n: Value(value, sigma, units[n].unit, float(given[n].detach())) for n, value, sigma in values}
 
 
 def _excluded(found: Found, tracks: Sequence[Track]) -> tuple[str, ...]:

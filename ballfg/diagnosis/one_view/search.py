@@ -16,7 +16,7 @@ from ballfg.diagnosis.evidence.odds import Odds
 from ballfg.diagnosis.evidence.prior import centres, scales
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, hypotheses
 from ballfg.diagnosis.one_view.noise import with_likeliest_noise
-from ballfg.diagnosis.one_view.picture import ERRORS
+from ballfg.diagnosis.one_view.picture import ERRORS, NAMES
 from ballfg.diagnosis.one_view.strokes import Laws, Stroke, all_estimated, scores_again
 from ballfg.diagnosis.one_view.weights import Set, Weights, mean_of, odds_of, slopes_of
 from ballfg.dynamics import AnalyticModel, Surfaces
@@ -47,7 +47,8 @@ class Found:
     Attributes:
         laws: of the most probable set.  weights: about them.  best: that set.  odds: of all sets.
         strokes: as estimated with these laws.
-        first: the declared coefficients and the lift, fitted without any effect.
+        first: the declared coefficients, fitted without any effect.
+        with_lift: the same and the lift, fitted beside the effects of the set.
     """
 
     laws: Laws
@@ -55,7 +56,8 @@ class Found:
     best: Set
     odds: Odds
     strokes: Sequence[Stroke]
-    first: Set
+    first: Mapping[str, float]
+    with_lift: Set
 
 
 def search(
@@ -69,14 +71,12 @@ def search(
 ) -> Found:
     """What a model lacks, by the sightings of tracks that one camera saw.
 
-    Args: settings: their coefficients are fitted to all strokes, with priors of these widths, and so is the lift.
+    Args: settings: their coefficients are fitted to all strokes, with priors of these widths.
     Raises: ValueError: fewer than `LEAST` strokes whose place is known well.
     """
     declared = dict(settings.coefficients)
-    with_lift = declared | _lift(model)
     given = {name: float(value.detach()) for name, value in model.named_parameters()}
-    stated = {name: given[name] for name in with_lift}
-    laws = Laws(model, surfaces, replace(settings, coefficients=with_lift), with_lift, stated)
+    laws = Laws(model, surfaces, settings, declared, {name: given[name] for name in declared})
     tell("estimating strokes")
     strokes: Sequence[Stroke] = all_estimated(laws, tracks, jobs)
     if len(strokes) < LEAST:
@@ -86,12 +86,12 @@ def search(
         )
     tell("looking at the noise of flights and bounces")
     laws = with_likeliest_noise(laws, [stroke.track for stroke in strokes], jobs)
+    absent = np.array([given[name] for name in declared])
     for _ in range(2):
         tell("fitting the declared coefficients")
-        place = _Place(laws, tracks, (), np.array(list(stated.values())), jobs).weighed()
-        first = place.best
-        laws, strokes = place.moved(first).laws, place.strokes
-    laws, absent = _held(laws, declared), np.array([given[name] for name in declared])
+        place = _Place(laws, tracks, (), absent, jobs).weighed()
+        laws, strokes = place.moved(place.best).laws, place.strokes
+    first = dict(laws.values)
     laws, asked, centre = _asking(laws, strokes, model, catalogue)
     tell(f"filming strokes again with each of {len(asked)} effects")
     start = _Place(laws, tracks, asked, np.append(absent, centre), jobs).weighed()
@@ -113,19 +113,26 @@ def search(
             break
     end = places[-1]
     best = end.weights.weighed(listed)
-    return Found(end.laws, end.weights, best, odds, end.strokes, first)
+    tell("fitting the lift beside the declared coefficients")
+    return Found(end.laws, end.weights, best, odds, end.strokes, first, _with_lift(end, model, declared))
 
 
-def _lift(model: AnalyticModel) -> dict[str, float]:
-    """The prior standard deviation of the lift: strokes without spin labels show it together, at their bounces."""
+def _with_lift(end: "_Place", model: AnalyticModel, declared: Mapping[str, float]) -> Set:
+    """The declared coefficients and the lift, which strokes without spin labels show at their bounces.
+
+    The lift is left out of the search: beside it, a wrong clock or lens is a wrong lift and an effect less probably.
+    """
     lift = model.declared_coefficients().get(LIFT)
-    return {} if lift is None or not lift.sigma > 0.0 else {LIFT: lift.sigma}
-
-
-def _held(laws: Laws, asked: Mapping[str, float]) -> Laws:
-    """The laws that ask about some strengths alone, of these sizes; the others stay where they are."""
-    settings = replace(laws.settings, coefficients=dict(asked))
-    return replace(laws, settings=settings, sizes=asked, values={name: laws.values[name] for name in asked})
+    sizes = dict(declared) | ({LIFT: lift.sigma} if lift is not None and lift.sigma > 0.0 else {})
+    given = {name: float(model.get_parameter(name).detach()) for name in sizes}
+    laws = replace(end.laws, settings=replace(end.laws.settings, coefficients=sizes))
+    pictured = {name: value for name, value in laws.values.items() if name in NAMES}
+    values = {name: laws.values.get(name, given[name]) for name in sizes} | pictured
+    place = _Place(replace(laws, sizes=sizes, values=values), end.tracks, (), np.array(list(given.values())), end.jobs)
+    for _ in range(2):
+        place = place.weighed()
+        place = place.moved(place.best)
+    return place.best
 
 
 def _odds_at(place: "_Place", names: frozenset[str]) -> float:

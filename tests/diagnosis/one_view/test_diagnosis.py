@@ -39,7 +39,7 @@ def found_clock(tracks: list[Track]) -> Found:
     weights = Weights(tuple(sizes), *arrays, 1, np.zeros(3), 0.01 * np.eye(3), np.eye(3), len(tracks), (clock, lens))
     (stroke, *rest) = all_estimated(laws, tracks, 1)
     best = weights.weighed((clock,))
-    return Found(laws, weights, best, odds_of([weights]), (stroke, *rest), weights.weighed(()))
+    return Found(laws, weights, best, odds_of([weights]), (stroke, *rest), {DRAG: drag}, weights.weighed(()))
 
 
 def test_what_is_told_of_a_clock(tmp_path: Path) -> None:
