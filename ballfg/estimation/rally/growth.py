@@ -16,6 +16,8 @@ SHORT: Final = 0.4
 """Of a picture's time, over which a path shows its motion."""
 MISSED, RARE = 3, 0.02
 """Pictures that a flight may pass without a candidate, at least; more, as long as that is not rarer than this."""
+LOST: Final = 0.12
+"""s for which a flight may pass without a candidate all the same: what hides a ball hides it in many quick pictures."""
 GATE: Final = 12.0
 """Squared Mahalanobis distance of a candidate from where it is foretold."""
 BOUNCE: Final = 2.0
@@ -207,7 +209,7 @@ def grown(rays, candidates, begins, scene, view, rows, bounces, way):
     missed, frame, unseen = 0, candidates[rows[-1 if way > 0 else 0]].frame, math.log(1.0 - view.seen)
     stroke = rated(rays, candidates, scene, view, rows, bounces)
     careful, best, top, doubtful = rows, rows, stroke.score, False
-    most = max(MISSED, int(math.log(RARE) / unseen))
+    most = max(MISSED, int(LOST / view.step), int(math.log(RARE) / unseen))
     while missed <= most:
         frame += way
         if not 0 <= frame < len(begins) - 1:

@@ -26,6 +26,8 @@ STEP: Final = 0.2
 """Pictures between guessed times of a bounce."""
 INSIDE, AHEAD = 3.0, 4.0
 """Pictures before and beyond the last candidate in which a bounce is guessed: an arc may pass a low one."""
+WITHIN: Final = 0.04
+"""s that such a picture counts for at least: quicker ones are as many more."""
 ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
 FOLLOWED: Final = 4
@@ -169,7 +171,8 @@ class Grower:
         """The stroke with a bounce after its last candidate (way 1) or before its first (-1), and what follows it."""
         times = self.scene.rays.times[stroke.rows]
         end = times[-1] if way > 0 else times[0]
-        steps = np.arange(-INSIDE, AHEAD, STEP) * self.field.step
+        more = max(1, int(WITHIN / self.field.step + 1e-6))
+        steps = np.arange(-INSIDE * more, AHEAD * more, STEP) * self.field.step
         guesses = end + way * steps
         known = np.array(stroke.bounces)
         guesses = guesses[np.abs(guesses[:, None] - known).min(axis=1, initial=np.inf) > 2.0 * self.field.step]
