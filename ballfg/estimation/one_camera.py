@@ -48,7 +48,7 @@ def track_one_camera(
     strokes = search(detections, camera, model, surfaces, watch=watch)[0].strokes
     for stroke in watch(strokes, len(strokes), "strokes estimated"):
         if len(stroke.rows) >= LEAST_SEEN:  # alone and by its sightings, as it is estimated again from a dataset
-            seen = _sightings(detections, stroke.rows)
+            seen = _sightings(detections, stroke.rows, camera.name)
             estimate = smoother.estimate(sighted_track("stroke", seen, [camera], model=model, surfaces=surfaces))
             positions, views = estimate.states[:, POSITION], np.ones(len(estimate), dtype=np.int64)
             spread = estimate.covariances[:, POSITION, POSITION]
@@ -59,7 +59,7 @@ def track_one_camera(
     return Strokes(tracking, tuple(replace(estimate, name=name) for name, (_, estimate) in named))
 
 
-def _sightings(seen: Detections, rows: Index) -> Sightings:
+def _sightings(seen: Detections, rows: Index, camera: str) -> Sightings:
     """Some candidates as the sightings of one ball."""
     own = (seen.times[rows], seen.pixels[rows], seen.covariances[rows])
-    return Sightings((seen.camera,), np.zeros(len(rows), dtype=np.int64), *own)
+    return Sightings((camera,), np.zeros(len(rows), dtype=np.int64), *own)
