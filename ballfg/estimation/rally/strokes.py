@@ -27,7 +27,7 @@ STEP: Final = 0.2
 INSIDE, AHEAD = 3.0, 4.0
 """Pictures before and beyond the last candidate in which a bounce is guessed: an arc may pass a low one."""
 WITHIN: Final = 0.04
-"""s that such a picture counts for at least: quicker ones are as many more."""
+"""s that each of these pictures stands for at least: for several quick ones together."""
 ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
 FOLLOWED: Final = 4
@@ -172,7 +172,7 @@ class Grower:
         times = self.scene.rays.times[stroke.rows]
         end = times[-1] if way > 0 else times[0]
         more = max(1, int(WITHIN / self.field.step + 1e-6))
-        steps = np.arange(-INSIDE * more, AHEAD * more, STEP) * self.field.step
+        steps = more * np.arange(-INSIDE, AHEAD, STEP) * self.field.step
         guesses = end + way * steps
         known = np.array(stroke.bounces)
         guesses = guesses[np.abs(guesses[:, None] - known).min(axis=1, initial=np.inf) > 2.0 * self.field.step]
