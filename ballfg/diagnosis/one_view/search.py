@@ -120,7 +120,7 @@ def search(
 def _with_lift(end: "_Place", model: AnalyticModel, declared: Mapping[str, float]) -> Set:
     """The declared coefficients and the lift, which strokes without spin labels show at their bounces.
 
-    The lift is left out of the search: beside it, a wrong clock or lens is a wrong lift and an effect less probably.
+    The search leaves the lift where the model has it: a free one takes over a part of what other effects do.
     """
     lift = model.declared_coefficients().get(LIFT)
     sizes = dict(declared) | ({LIFT: lift.sigma} if lift is not None and lift.sigma > 0.0 else {})
