@@ -1,17 +1,15 @@
-"""Turns the candidates of one fixed camera into the strokes of a ball, each with its estimate."""
+"""Turns the candidates of one fixed camera into the strokes of a ball, each with its estimate, and their events."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.arrays import Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.sightings import LEAST_SEEN, sighted_track
-from ballfg.estimation.rally.reconstruct import search
+from ballfg.estimation.rally.events import events_of
+from ballfg.estimation.rally.moments import Event
+from ballfg.estimation.rally.reconstruct import strokes_of
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
 from ballfg.state import POSITION
 from ballfg.tracks.sightings import Sightings
@@ -23,10 +21,14 @@ from ballfg.vision.tracking.pipeline import Tracking
 
 @dataclass(frozen=True, eq=False)
 class Strokes:
-    """The strokes of a recording of one camera, and the estimate of each, in the same order."""
+    """The strokes of a recording of one camera, the estimate of each in the same order, and hits, bounces, ends.
+
+    The candidates of `tracking` have the noise that the strokes show. Estimates are joined at hits.
+    """
 
     tracking: Tracking
     estimates: tuple[Estimate, ...]
+    events: tuple[Event, ...]
 
     @property
     def doubts(self) -> list[str]:
@@ -44,22 +46,14 @@ def track_one_camera(
         detections: all candidates of the camera, good and bad.  camera: with its place.
         model, surfaces: of the ball, and of what it bounces on.  watch: sees the flights that are followed.
     """
-    smoother, pairs = Smoother(model, surfaces, Settings.for_measured(model)), list[tuple[SeenBall, Estimate]]()
-    strokes = search(detections, camera, model, surfaces, watch=watch)[0].strokes
-    for stroke in watch(strokes, len(strokes), "strokes estimated"):
-        if len(stroke.rows) >= LEAST_SEEN:  # alone and by its sightings, as it is estimated again from a dataset
-            seen = _sightings(detections, stroke.rows, camera.name)
-            estimate = smoother.estimate(sighted_track("stroke", seen, [camera], model=model, surfaces=surfaces))
-            positions, views = estimate.states[:, POSITION], np.ones(len(estimate), dtype=np.int64)
-            spread = estimate.covariances[:, POSITION, POSITION]
-            pairs.append((SeenBall(estimate.times, positions, spread, seen, views), estimate))
-    pairs.sort(key=lambda pair: float(pair[0].times[0]))
-    tracking = Tracking((camera,), (detections,), tuple(ball for ball, _ in pairs), None)
-    named = zip(tracking.names, pairs, strict=True)
-    return Strokes(tracking, tuple(replace(estimate, name=name) for name, (_, estimate) in named))
-
-
-def _sightings(seen: Detections, rows: Index, camera: str) -> Sightings:
-    """Some candidates as the sightings of one ball."""
-    own = (seen.times[rows], seen.pixels[rows], seen.covariances[rows])
-    return Sightings((camera,), np.zeros(len(rows), dtype=np.int64), *own)
+    found = strokes_of(detections, camera, model, surfaces, watch=watch)
+    seen, pairs = found.seen, list[tuple[Estimate, SeenBall]]()
+    for stroke, estimate in zip(found.chosen.strokes, found.estimates, strict=True):
+        own = (seen.times[stroke.rows], seen.pixels[stroke.rows], seen.covariances[stroke.rows])
+        sightings = Sightings((camera.name,), np.zeros(len(stroke.rows), dtype=np.int64), *own)
+        spread, views = estimate.covariances[:, POSITION, POSITION], np.ones(len(estimate), dtype=np.int64)
+        pairs.append((estimate, SeenBall(estimate.times, estimate.states[:, POSITION], spread, sightings, views)))
+    pairs.sort(key=lambda pair: pair[0].name)
+    events = events_of(found, model, surfaces, float(np.median(np.diff(seen.frames)))) if pairs else []
+    tracking = Tracking((camera,), (seen,), tuple(ball for _, ball in pairs), None)
+    return Strokes(tracking, tuple(estimate for estimate, _ in pairs), tuple(events))

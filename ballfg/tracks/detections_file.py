@@ -42,6 +42,7 @@ RULES: Final[Mapping[str, Rule]] = {
     "sigma_radius": _SIGMA,
 }
 DETECTIONS_FILE: Final = "detections.csv"
+EVENTS_FILE: Final = "events.csv"  # hits, bounces and ends of the same balls, where one camera saw them
 REQUIRED: Final = (KEY, "t", CAMERA, "u", "v")
 BEYOND: Final = 0.05
 """Share of a picture's size by which a place may lie beyond it: the centre of a ball that is cut by the border."""

@@ -16,10 +16,9 @@ from ballfg.estimation import Status
 from ballfg.estimation.one_camera import Strokes, track_one_camera
 from ballfg.estimation.rally.arcs import BENT, CARRIED, MOSTLY, arcs, telling
 from ballfg.estimation.rally.field import FLATTEST, Field, at_court
-from ballfg.estimation.rally.reconstruct import strokes_of, without_lens
+from ballfg.estimation.rally.reconstruct import without_lens
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Candidates, Detections
-from ballfg.vision.tracking.pipeline import Tracking
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
 
 RATE, NOISE = 50.0, 0.5
@@ -229,14 +228,24 @@ def test_a_recording_without_a_ball_has_no_strokes(ball: World) -> None:
             assert strokes.doubts == []
 
 
-def test_a_fixed_camera_may_join_its_strokes_at_hits(ball: World) -> None:
+def test_strokes_are_joined_at_hits_and_have_their_bounces(ball: World) -> None:
     times, states = rally(ball)
     late = replace(SIDE, time_offset=0.5)
-    joined, other = (strokes_of(seen(times, states, 3), camera, ball.model, ball.surfaces) for camera in (SIDE, late))
-    moments = [hit.t - 100.0 for hit in joined.hits if hit is not None]
-    assert moments
-    assert np.abs(np.subtract.outer(moments, HITS)).min(axis=1).max() < 0.03
-    assert max(judged(Strokes(Tracking((), (), (), None), joined.estimates), times, states)) < 0.08
+    joined, other = (
+        track_one_camera(seen(times, states, 3), camera, ball.model, ball.surfaces) for camera in (SIDE, late)
+    )
+    of: dict[str, list[float]] = {kind: [] for kind in ("hit", "bounce", "lost")}
+    for event in joined.events:
+        of[event.kind].append(event.t - 100.0)
+    assert of["hit"]
+    assert np.abs(np.subtract.outer(of["hit"], HITS[1:-1])).min(axis=1).max() < 0.03
+    assert len(of["hit"]) + len(of["lost"]) == len(joined.estimates) == 3
+    (rising,) = np.nonzero(np.diff(states[:, 5]) > 1.0)
+    assert {event.trajectory for event in joined.events if event.kind == "bounce"} == {"000", "001", "002"}
+    for bounce in of["bounce"]:
+        between = np.flatnonzero((times[rising] <= bounce + 3e-3) & (bounce - 3e-3 <= times[rising + 1]))
+        assert len(between) == 1
+    np.testing.assert_allclose([event.t + 0.5 for event in other.events], [one.t for one in joined.events], atol=1e-4)
     for one, moved in zip(joined.estimates, other.estimates, strict=True):
         np.testing.assert_allclose(moved.times, one.times - 0.5, atol=1e-9)
         np.testing.assert_allclose(moved.states, one.states, rtol=1e-4, atol=1e-3)

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
 from ballfg.progress import print_notes, progress
 
 if TYPE_CHECKING:
-    from ballfg.arrays import Array
     from ballfg.dynamics import AnalyticModel, Surfaces
     from ballfg.simulation.balls import BallKind
     from ballfg.vision import Camera
@@ -78,21 +77,23 @@ def track(
 
     Example: ballfg track rally.mp4 --out rally
 
-    The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml; of one camera states.csv in place of
-    tracks.csv.
+    The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml; of one camera states.csv and
+    events.csv in place of tracks.csv.
     overlay.mp4 shows the views with what was found, contact_sheet.png each track.
     """
     # FFmpeg and OpenCV print messages on a file, unless switched off before the import of OpenCV.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from ballfg.estimation.one_camera import track_one_camera
+    from ballfg.estimation.rally.tables import event_columns, state_columns
     from ballfg.files.whole_folder import reserved
     from ballfg.simulation.balls import ball_kind
+    from ballfg.tracks.detections_file import EVENTS_FILE
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
     from ballfg.vision.detection.detections import read_detections
     from ballfg.vision.tracking import pipeline
-    from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
+    from ballfg.vision.tracking.dataset import STATES, check_result_folder, write_tracking
 
     kind = ball_kind(ball)
     if cameras is None:
@@ -121,10 +122,13 @@ def track(
             print_notes(notes)
         else:
             detections, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs, without or ())
-        states: list[dict[str, Array]] | None = None
+        tables: dict[str, list[dict[str, Any]]] | None = None
         if len(rig) == 1:
             strokes = track_one_camera(detections[0], rig[0], kind.model, surfaces, watch=progress)
-            tracking, states = strokes.tracking, [estimate.columns for estimate in strokes.estimates]
+            tracking, tables = strokes.tracking, {}
+            if strokes.estimates:
+                tables[EVENTS_FILE] = [event_columns(strokes.events)]
+                tables[STATES] = [state_columns(estimate) for estimate in strokes.estimates]
             print_notes(strokes.doubts)
             info = replace(info, table_extent=surfaces.extent)
         else:
@@ -136,7 +140,7 @@ def track(
             print_notes([doubt])
         info = replace(info, rate=tracking.rate)
         written = write_tracking(
-            out, tracking, info, table=surfaces.extent, streams=streams, states=states, overlay=overlay, watch=progress
+            out, tracking, info, table=surfaces.extent, streams=streams, tables=tables, overlay=overlay, watch=progress
         )
         if not tracking.balls:
             pictures = [one for one in written if not one.endswith((".csv", ".yaml"))]

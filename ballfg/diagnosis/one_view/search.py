@@ -129,10 +129,8 @@ def _with_lift(end: "_Place", model: AnalyticModel, declared: Mapping[str, float
     pictured = {name: value for name, value in laws.values.items() if name in NAMES}
     values = {name: laws.values.get(name, given[name]) for name in sizes} | pictured
     place = _Place(replace(laws, sizes=sizes, values=values), end.tracks, (), np.array(list(given.values())), end.jobs)
-    for _ in range(2):
-        place = place.weighed()
-        place = place.moved(place.best)
-    return place.best
+    place = place.weighed()
+    return place.moved(place.best).weighed(place.weights.slopes).weights.weighed(())
 
 
 def _odds_at(place: "_Place", names: frozenset[str]) -> float:

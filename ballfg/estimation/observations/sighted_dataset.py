@@ -16,7 +16,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks import csv_files
-from ballfg.tracks.detections_file import DETECTIONS_FILE, check_inside, read_sightings
+from ballfg.tracks.detections_file import DETECTIONS_FILE, EVENTS_FILE, check_inside, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.rows import KEY
@@ -129,7 +129,6 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     return dataset
 
 
-EVENTS_FILE: Final = "events.csv"
 NEEDED: Final = (KEY, "t", "kind")
 
 

@@ -21,26 +21,38 @@ TOUCHES: Final = 0.5
 """Least probability of a touch of the net that is an event."""
 
 
-def events_of(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float, net: float) -> list[Event]:
-    """The events of a shot in order of time. Args: step: s between pictures.  net: m, its height at x = 0; 0: none."""
-    found, last = list[Event](), len(one.estimates) - 1
-    for number, estimate in enumerate(one.estimates):
-        chance = float(one.chosen.probabilities[number])
+def events_of(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float) -> list[Event]:
+    """Hits between two strokes, bounces, and where balls end, in order of time. Args: step: s between pictures."""
+    found = list[Event]()
+    for number, (estimate, chance) in enumerate(zip(one.estimates, one.chosen.probabilities.tolist(), strict=True)):
         hit = one.hits[number]
         if hit is not None:
             both = chance * float(one.chosen.probabilities[number - 1])
             found.append(replace(hit, trajectory=estimate.name, probability=both))
-        else:
-            found.append(replace(first_hit(model, estimate, surfaces, step), probability=chance))
         found += [replace(event, probability=chance) for event in bounces_of(model, estimate)]
-        ends = number == last or not one.chosen.joined[number + 1]
-        found += [
-            replace(touch, probability=chance * touch.probability)
-            for touch in net_touches(model, estimate, surfaces, net, LANDS * step if ends else 0.0)
-        ]
-        if ends:
+        if _ends(one, number):
             found.append(replace(end_of(model, estimate, surfaces, step), probability=chance))
     return sorted(found, key=lambda event: event.t)
+
+
+def events_in_play(one: ShotRally, model: BallModel, surfaces: Surfaces, step: float, net: float) -> list[Event]:
+    """The events of a rally in order of time, with the hits of first strokes and the net.
+
+    Args: step: s between pictures.  net: m, its height at x = 0; 0: none.
+    """
+    found = events_of(one, model, surfaces, step)
+    for number, (estimate, chance) in enumerate(zip(one.estimates, one.chosen.probabilities.tolist(), strict=True)):
+        if one.hits[number] is None:
+            found.append(replace(first_hit(model, estimate, surfaces, step), probability=chance))
+        beyond = LANDS * step if _ends(one, number) else 0.0
+        touches = net_touches(model, estimate, surfaces, net, beyond)
+        found += [replace(touch, probability=chance * touch.probability) for touch in touches]
+    return sorted(found, key=lambda event: event.t)
+
+
+def _ends(one: ShotRally, number: int) -> bool:
+    """True if no stroke follows that a hit joins to this one."""
+    return number == len(one.estimates) - 1 or not one.chosen.joined[number + 1]
 
 
 def bounces_of(model: BallModel, estimate: Estimate) -> list[Event]:

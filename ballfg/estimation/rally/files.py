@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from ballfg.estimation.observations.sighted_dataset import EVENTS_FILE
-from ballfg.tracks.detections_file import DETECTIONS_FILE
+from ballfg.tracks.detections_file import DETECTIONS_FILE, EVENTS_FILE
 from ballfg.tracks.info import INFO_FILE
 from ballfg.vision.camera_file import CAMERAS_FILE
 

@@ -139,7 +139,7 @@ def strokes_of(
 
     Args:
         seen: its candidates.  model: the ball.  surfaces: with the court's ends, if they are known.
-        first: number of the first stroke; strokes are named by three digits.
+        first: number of the first stroke; strokes are named by three digits, in order of time.
         seen_share: probability that the ball is among the candidates of a picture, at first.
         play: True for one ball in play, as `Field` has it; False for all flights, of several balls too.
     """
@@ -155,7 +155,8 @@ def strokes_of(
     begun, end = _in_play(alone) if play else (0, len(alone))
     joined = (False, *chosen.joined[begun + 1 : end])
     estimates, hits = joined_estimates(smoother, tracks[begun:end], alone[begun:end], joined, field.step)
-    named = [replace(one, name=f"{first + number:03d}") for number, one in enumerate(estimates)]
+    places = np.argsort(np.argsort([one.times[0] for one in estimates], kind="stable"), kind="stable")
+    named = [replace(one, name=f"{first + k:03d}") for k, one in zip(places.tolist(), estimates, strict=True)]
     parts = (chosen.strokes[begun:end], chosen.probabilities[begun:end], joined)
     return ShotRally(camera, seen, Chosen(*parts) if named else chosen, tuple(named), tuple(hits), field.exposure)
 

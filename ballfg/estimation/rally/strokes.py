@@ -16,6 +16,7 @@ from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, possible, shares_of, solved
 from ballfg.estimation.observations.ray_path import Rays
+from ballfg.estimation.rally.arcs import SLOWEST
 from ballfg.estimation.rally.field import Field, ends_of
 from ballfg.estimation.rally.growth import CANDIDATE, VIEW, all_rated, filled, grown, rated
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
@@ -31,7 +32,7 @@ WITHIN: Final = 0.04
 ALIKE: Final = 10.0
 """Misfit above the best guess's, of guesses that are followed."""
 FOLLOWED: Final = 4
-"""Guesses that are followed, the best one between two pictures: those beside it meet the same candidates."""
+"""Guesses that are followed of so many pictures, the best one between two: those beside it meet the same candidates."""
 LEAST: Final = 4
 """Candidates of a shortened stroke."""
 BETWEEN: Final = 0.1
@@ -42,8 +43,7 @@ CUT: Final = 12
 """Candidates at an end of a stroke that may belong to the next one, or to clutter: seen from behind a player, a flight
 goes on smoothly for some pictures after a hit."""
 SPEEDS: Final = (2.0, 40.0)
-"""m/s, of a stroke, along the court at least and in all at most; where any flight counts, and where the court's ends
-are not known, no way is along it."""
+"""m/s, of a stroke in play along the court at least, and of any flight in all at most."""
 ROOM: Final = (3.6, 3.6, 5.0)
 """Half lengths and half widths of the court, and half widths above it, in which a ball is in play."""
 
@@ -138,10 +138,8 @@ class Grower:
             return False
         if (np.diff(stroke.bounces) < BETWEEN).any():
             return False
-        velocities, ends = stroke.path.vectors[0, 1 : stroke.path.bounces + 2], ends_of(self.scene.surfaces)
-        fastest = float(np.linalg.norm(velocities, axis=1).max())
-        along = np.abs(velocities[:, 0]).max() if self.field.play and ends is not None else fastest
-        if not (along > SPEEDS[0] and fastest < SPEEDS[1]):
+        ends = ends_of(self.scene.surfaces)
+        if not self._moves(stroke, along=self.field.play and ends is not None):
             return False
         if ends is None:
             return True
@@ -152,6 +150,20 @@ class Grower:
         high = np.append(middle + half * ROOM[:2], ROOM[2] * half[1])
         slack = 2.0 * np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
         return bool(((positions > low - slack) & (positions < high + slack)).all())
+
+    def _moves(self, stroke: Stroke, *, along: bool) -> bool:
+        """True if a stroke is as fast as a ball; along: along the court, else by any speed that it may have.
+
+        A tiny flight just before the camera, slow and carried by lift, would explain anything.
+        """
+        velocities = stroke.path.vectors[0, 1 : stroke.path.bounces + 2]
+        speeds = np.linalg.norm(velocities, axis=1)
+        fastest = int(np.argmax(speeds))
+        if along:
+            return bool(np.abs(velocities[:, 0]).max() > SPEEDS[0] and speeds[fastest] < SPEEDS[1])
+        part = slice(3 * (fastest + 1), 3 * (fastest + 2))
+        sigma = float(np.sqrt(np.linalg.eigvalsh(stroke.path.covariance[0, part, part])[-1]))
+        return bool(speeds[fastest] + 2.0 * sigma > SLOWEST and speeds[fastest] < SPEEDS[1])
 
     def _grown(self, rows: Index, bounces: tuple[float, ...], way: int) -> list[Index]:
         """The candidates of one or two strokes that go on after those of a stroke (way 1) or before them (-1)."""
@@ -187,7 +199,7 @@ class Grower:
         _, best = np.unique(
             np.floor((guesses[order] - end) / self.field.step), return_index=True
         )  # between two pictures
-        for row in order[np.sort(best)[:FOLLOWED]]:
+        for row in order[np.sort(best)[: more * FOLLOWED]]:
             if misfit[row] > misfit.min() + ALIKE or not np.isfinite(misfit[row]):
                 return
             bounces = tuple(together[row].tolist())

@@ -11,6 +11,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.rally.files import COURT, EVENTS, FILES, MOTION, STATES, STROKES
 from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally
+from ballfg.estimation.result import Estimate
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import TableWriter
 from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
@@ -22,6 +23,7 @@ from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 
 POSE: Final = ("focal", "rx", "ry", "rz", "tx", "ty", "tz")
+NOWHERE: Final = np.full(3, np.nan)
 TINY: Final = 1e-6
 """Step of numerical derivatives, rad, m or a part of the focal length."""
 
@@ -50,7 +52,9 @@ def write_rally(
         _write_motion(stage / MOTION, motion)
         if court:
             (stage / COURT).write_text(court, encoding="utf-8")
-        _write_events(stage / EVENTS, events, motion)
+        cuts = [Event("", float(motion.times[k]), "cut", NOWHERE, 0.0, NOWHERE, 1.0) for k in motion.cuts]
+        with TableWriter(stage / EVENTS) as table:
+            table.write(event_columns((*events, *cuts)))
         with TableWriter(stage / DETECTIONS_FILE) as table:
             for one in rallies:
                 names = np.full(len(one.seen), "", dtype=object)
@@ -61,14 +65,14 @@ def write_rally(
         if strokes:
             with TableWriter(stage / STATES) as states:
                 for estimate in (estimate for one in rallies for estimate in one.estimates):
-                    states.write({KEY: estimate.name, **estimate.columns, **_correlations(estimate.covariances)})
+                    states.write(state_columns(estimate))
             with TableWriter(stage / STROKES, plain=["end"]) as table:
                 table.write({name: np.array([row[name] for row in strokes]) for name in strokes[0]})
         return [name for name in FILES if (stage / name).is_file()]
 
 
 def _correlations(covariances: Array) -> dict[str, Array]:
-    """The correlations of positions: along a ray of the one camera the place is less sure than across it."""
+    """The correlations of positions."""
     pairs = {"rho_xy": (0, 1), "rho_xz": (0, 2), "rho_yz": (1, 2)}
     sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     return {name: covariances[:, i, j] / (sigmas[:, i] * sigmas[:, j]) for name, (i, j) in pairs.items()}
@@ -101,23 +105,22 @@ def _sigmas(camera: Pinhole, covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.diag(slope @ covariance @ slope.T)))
 
 
-def _write_events(path: Path, events: Sequence[Event], motion: Motion) -> None:
-    """Hits, bounces, where the ball was lost, and cuts of the recording."""
-    cuts = [
-        Event("", float(motion.times[k]), "cut", np.full(3, np.nan), 0.0, np.full(3, np.nan), 1.0) for k in motion.cuts
-    ]
-    rows = sorted((*events, *cuts), key=lambda event: event.t)
+def event_columns(events: Sequence[Event]) -> dict[str, Any]:
+    """The columns of events.csv: hits, bounces, where the ball was lost, cuts of the recording, in order of time."""
+    rows = sorted(events, key=lambda event: event.t)
     places = np.array([event.place for event in rows]).reshape(-1, 3)
     sigmas = np.array([event.sigmas for event in rows]).reshape(-1, 3)
-    with TableWriter(path) as table:
-        table.write(
-            {
-                KEY: np.array([event.trajectory for event in rows], dtype=object),
-                "t": np.array([event.t for event in rows], dtype=np.float64),
-                "kind": np.array([event.kind for event in rows], dtype=object),
-                **dict(zip("xyz", places.T, strict=True)),
-                "sigma_t": np.array([event.sigma_t for event in rows], dtype=np.float64),
-                **dict(zip(("sigma_x", "sigma_y", "sigma_z"), sigmas.T, strict=True)),
-                "probability": np.array([event.probability for event in rows], dtype=np.float64),
-            }
-        )
+    return {
+        KEY: np.array([event.trajectory for event in rows], dtype=object),
+        "t": np.array([event.t for event in rows], dtype=np.float64),
+        "kind": np.array([event.kind for event in rows], dtype=object),
+        **dict(zip("xyz", places.T, strict=True)),
+        "sigma_t": np.array([event.sigma_t for event in rows], dtype=np.float64),
+        **dict(zip(("sigma_x", "sigma_y", "sigma_z"), sigmas.T, strict=True)),
+        "probability": np.array([event.probability for event in rows], dtype=np.float64),
+    }
+
+
+def state_columns(estimate: Estimate) -> dict[str, Any]:
+    """The columns of states.csv: along a ray of the one camera the place is less sure than across it."""
+    return {KEY: estimate.name, **estimate.columns, **_correlations(estimate.covariances)}

@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.rally.events import events_of, stroke_row
+from ballfg.estimation.rally.events import events_in_play, stroke_row
 from ballfg.estimation.rally.field import SEEN, UNKNOWN
 from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally, reconstruct
@@ -100,7 +100,7 @@ def track_moving_camera(
             reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)
             for found in sought
         )
-        mine = events_of(one, model, surfaces, step, court.net)
+        mine = events_in_play(one, model, surfaces, step, court.net)
         seen = scale.detections_of_video(one.seen)
         shots.append(replace(one, camera=scale.camera_of_video(one.camera), seen=seen))
         events += mine

@@ -3,15 +3,14 @@
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from ballfg.arrays import Array
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import TableWriter, write_dataset
-from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
+from ballfg.tracks.detections_file import DETECTIONS_FILE, EVENTS_FILE, SCORE, seen_columns
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.vision.arrays import Image
@@ -26,7 +25,7 @@ TRACKS: Final = "tracks.csv"
 OVERLAY: Final = "overlay.mp4"
 SHEET: Final = "contact_sheet.png"
 STATES: Final = "states.csv"
-FILES: Final = (INFO_FILE, TRACKS, STATES, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)  # all written files
+FILES: Final = (INFO_FILE, TRACKS, STATES, EVENTS_FILE, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)  # all written
 
 
 def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool, files: Sequence[str] = FILES) -> None:
@@ -50,7 +49,7 @@ def write_tracking(
     *,
     table: Extent | None = None,
     streams: Streams | None = None,
-    states: Sequence[Mapping[str, Array]] | None = None,
+    tables: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
     overlay: bool = True,
     watch: Watch = unwatched,
 ) -> list[str]:
@@ -64,19 +63,19 @@ def write_tracking(
         info: the content of dataset.yaml.
         table: (x_low, x_high, y_low, y_high) m, drawn in the contact sheet; None where it is not known.
         streams: the videos; None where there are none: then there is no overlay, and the sheet has no pictures.
-        states: columns (n,) of each ball's states, those of `ballfg estimate` in SI units; then states.csv takes the
-            place of tracks.csv: the depth of points that one camera saw is no measurement.
+        tables: name of a file -> parts of its table, columns (n,) each, which take the place of tracks.csv: the depth
+            of points that one camera saw is no measurement.
         watch: sees the frames of the overlay that are drawn.
     Returns: the names of the files.
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
     """
     with whole_folder(folder, earlier=FILES) as stage:
-        if states is not None:
+        if tables is not None:
             write_info(stage / INFO_FILE, info)
-            if states:
-                with TableWriter(stage / STATES) as table_of_states:
-                    for name, columns_of_ball in zip(tracking.names, states, strict=True):
-                        table_of_states.write({KEY: name, **columns_of_ball})
+            for name, parts in tables.items():
+                with TableWriter(stage / name) as writer:
+                    for part in parts:
+                        writer.write(part)
         elif tracking.balls:
             write_dataset(stage, info, tracking.tracks)
         else:

@@ -17,7 +17,7 @@ from ballfg.benchmarks.cameras.rallies import Truth
 from ballfg.benchmarks.cameras.strokes import MODEL
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, read_sighted
-from ballfg.estimation.rally.events import end_of, events_of, net_touches, stroke_row
+from ballfg.estimation.rally.events import end_of, events_in_play, net_touches, stroke_row
 from ballfg.estimation.rally.files import is_rally
 from ballfg.estimation.rally.hits import HIT_SIGMA
 from ballfg.estimation.rally.moments import carried
@@ -40,7 +40,7 @@ NET = 0.1525
 def found_in(view: str, seed: int, missing: float = 0.0) -> tuple[Truth, Rally]:
     of, motion, found = planted(view, seed, missing=missing)
     one = reconstruct(found, motion.shots[0], MODEL, SURFACES)
-    events = events_of(one, MODEL, SURFACES, 0.04, NET)
+    events = events_in_play(one, MODEL, SURFACES, 0.04, NET)
     rows = [stroke_row(estimate, events, MODEL, NET) for estimate in one.estimates]
     return of, Rally(motion, (one,), tuple(events), tuple(rows))
 

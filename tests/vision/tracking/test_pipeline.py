@@ -30,6 +30,7 @@ RATE = 100.0
 FRAMES, START, END = 80, 20, 60
 SIGMA = 0.2
 INFO = DatasetInfo("made", 0.0, TABLE_TENNIS)
+WRITTEN = set(FILES) - {"overlay.mp4", "states.csv", "events.csv"}
 
 
 def camera(name: str, turn: float) -> Camera:
@@ -124,7 +125,7 @@ def test_cameras_and_detections_must_go_together(tracking: Tracking) -> None:
 def test_the_dataset_reads_back(tracking: Tracking, tmp_path: Path) -> None:
     out = tmp_path / "shots"
     written = write_tracking(out, tracking, INFO)
-    assert set(written) == set(FILES) - {"overlay.mp4", "states.csv"} == {path.name for path in out.iterdir()}
+    assert set(written) == {path.name for path in out.iterdir()} == WRITTEN
     (track,) = read_dataset(out)
     assert np.array_equal(track.positions, tracking.balls[0].points)
     assert np.array_equal(track.sigmas, tracking.tracks[0].sigmas)
@@ -179,7 +180,7 @@ def test_an_earlier_result_is_replaced_as_a_whole(tracking: Tracking, empty: Tra
         check_result_folder(out, [], force=False)
     check_result_folder(out, [], force=True)
     write_tracking(out, empty, INFO)
-    assert {path.name for path in out.iterdir()} == set(FILES) - {"overlay.mp4", "states.csv"}
+    assert {path.name for path in out.iterdir()} == WRITTEN
 
 
 def test_a_folder_in_which_something_would_be_lost_is_refused(tmp_path: Path) -> None:
