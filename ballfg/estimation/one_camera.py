@@ -45,7 +45,13 @@ def track_one_camera(
     Args:
         detections: all candidates of the camera, good and bad.  camera: with its place.
         model, surfaces: of the ball, and of what it bounces on.  watch: sees the flights that are followed.
+    Raises: ValueError: no surface.
     """
+    if not surfaces.heights():
+        raise ValueError(
+            "surfaces must hold one: a bounce on it shows how far away a ball is that one camera saw; got none. "
+            "Give a table_height."
+        )
     found = strokes_of(detections, camera, model, surfaces, watch=watch)
     seen, pairs = found.seen, list[tuple[Estimate, SeenBall]]()
     for stroke, estimate in zip(found.chosen.strokes, found.estimates, strict=True):

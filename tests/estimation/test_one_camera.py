@@ -179,6 +179,12 @@ def test_a_court_needs_no_ends(ball: World) -> None:
         assert max(judged(strokes, times, states)) < 0.08
 
 
+def test_no_surface_is_refused(ball: World) -> None:
+    times, states = rally(ball)
+    with pytest.raises(ValueError, match="surfaces must hold one"):
+        track_one_camera(seen(times, states, 3), SIDE, ball.model, Surfaces.none())
+
+
 def test_a_single_flight_without_a_bounce_is_a_stroke(ball: World) -> None:
     start = np.array([-1.0, -0.2, TABLE + 0.1, 1.8, 0.1, 3.2, 0.0, 0.0, 0.0])
     times = np.arange(1, 31) / RATE
