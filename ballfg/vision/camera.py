@@ -15,6 +15,7 @@ DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
 _PRECISELY: Final = (3, 60, 1e-12)  # cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 """OpenCV undoes distortion by five steps of a fixed point by default: 0.1 pixel off in a wide lens."""
+LONGEST_READOUT: Final = 0.1  # s, of all rows of an image
 WIDEST_ASKED: Final = 6.0  # tangent of the angle from the axis up to which a lens is tested: 80 degrees
 WIDEST_STEPS: Final = 6001
 
@@ -48,6 +49,9 @@ class Camera:
     """s, delay of the camera's stamps: an event stamped t happened at t - time_offset."""
     covariance: Array | None = None
     """(7, 7) of the errors of turn (about the world's axes, rad), centre (m) and log focal length; None: exact."""
+    readout: float = 0.0
+    """s from the exposure of the first row to that of the last, of a rolling shutter; below 0 if the last is first. A
+    stamp is that of the middle row."""
 
     def __post_init__(self) -> None:
         check_name("a camera's name", self.name)
@@ -78,6 +82,10 @@ class Camera:
         if self.covariance is not None:
             object.__setattr__(self, "covariance", _checked_covariance(where, self.covariance))
         object.__setattr__(self, "time_offset", check_number(f"{where}: time_offset", self.time_offset, "s"))
+        object.__setattr__(self, "readout", check_number(f"{where}: readout", self.readout, "s"))
+        if abs(self.readout) > LONGEST_READOUT:
+            rule = f"{where}: readout must be at most {LONGEST_READOUT:g} s; got {self.readout:g}"
+            raise ValueError(f"{rule}. It is shorter than a frame; give seconds.")
 
     @cached_property
     def rotation(self) -> Array:
@@ -104,6 +112,11 @@ class Camera:
         bent = r * (1 + q * (k1 + q * (k2 + q * k3))) / (1 + q * (k4 + q * (k5 + q * k6)))
         back = np.flatnonzero(np.diff(bent) <= 0.0)
         return float(r[back[0]]) if len(back) else np.inf
+
+    def true_times(self, stamps: Array, pixels: Array) -> Array:
+        """(n,) s, at which the camera saw pixels (n, 2) of frames with stamps (n,) s."""
+        late = 0.0 if self.readout == 0.0 else self.readout * ((pixels[:, 1] + 0.5) / self.size[1] - 0.5)
+        return np.asarray(stamps - self.time_offset + late)
 
     def project(self, points: ArrayLike) -> Array:
         """Projects points to pixels.

@@ -19,7 +19,9 @@ from ballfg.vision.camera import Camera
 CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
-FIELDS: Final = (*LENS, *POSE, "time_offset", "covariance")  # in the file's order; docs/calibrate.md explains them
+CLOCK: Final = ("time_offset", "readout")
+FIELDS: Final = (*LENS, *POSE, *CLOCK, "covariance")  # in the file's order; docs/calibrate.md explains them
+
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
     "matrix": (_MATRIX,),
@@ -69,13 +71,8 @@ def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path must end in .yaml; got {path}. Rename it; write_opencv writes .xml and .json.")
     cameras = _check_names(cameras)
-    fields = FIELDS if posed else (*LENS, "time_offset")
-    plain = {
-        camera.name: {
-            field: np.asarray(value).tolist() for field in fields if (value := getattr(camera, field)) is not None
-        }
-        for camera in cameras
-    }
+    fields = FIELDS if posed else (*LENS, *CLOCK)
+    plain = {camera.name: _stated(camera, fields) for camera in cameras}
     text = yaml.safe_dump({"cameras": plain}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     write_text(path, text)
 
@@ -110,7 +107,8 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
             for field in _NODES if posed else ("matrix", "distortion"):
                 array = getattr(camera, field)
                 storage.write(_NODES[field][0], array if array.ndim == 2 else array[:, None])
-            storage.write("time_offset", camera.time_offset)
+            for field in CLOCK:
+                storage.write(field, getattr(camera, field))
             storage.endWriteStruct()
         storage.release()
 
@@ -133,6 +131,12 @@ def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
     return {key: _fields(node, f"{path}: camera {shown(key)}") for key, node in cameras.items()}
 
 
+def _stated(camera: Camera, fields: Sequence[str]) -> dict[str, Any]:
+    """The fields that a file states: no covariance of an exact camera, no readout of one that sees all rows at once."""
+    absent = {"covariance": camera.covariance is None, "readout": camera.readout == 0.0}
+    return {field: np.asarray(getattr(camera, field)).tolist() for field in fields if not absent.get(field, False)}
+
+
 def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
     cameras = list(cameras)
     if not cameras:
@@ -153,17 +157,18 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
             f"{where}: field {missing[0]!r} is required; got {listed(fields)}. "
             "Add it, or let 'ballfg calibrate-cameras --intrinsics FILE --table TABLE' find where the camera stands."
         )
-    size, offset = fields["size"], fields.get("time_offset", 0.0)
+    size, clock = fields["size"], {field: fields.get(field, 0.0) for field in CLOCK}
     sides = size if isinstance(size, list | tuple) else ()
     if len(sides) != 2 or not all(is_number(side) and isinstance(side, Integral) for side in sides):
         what = f"{where}: size must be width and height in pixels, as [1280, 720]; got {shown(size)}"
         raise ValueError(f"{what}. Correct it.")
-    if not is_number(offset):
-        what = f"{where}: time_offset must be a number in s; got {shown(offset)}"
-        raise ValueError(f"{what}. Write it like 0.004 or 4.0e-3.")
+    for field, value in clock.items():
+        if not is_number(value):
+            what = f"{where}: {field} must be a number in s; got {shown(value)}"
+            raise ValueError(f"{what}. Write it like 0.004 or 4.0e-3.")
     rvec, tvec = (np.zeros(3) if missing else fields[field] for field in POSE)
-    covariance = fields.get("covariance")
-    return Camera(name, (sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec, offset, covariance)
+    own = ((sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec)
+    return Camera(name, *own, covariance=fields.get("covariance"), **clock)
 
 
 def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:
@@ -181,6 +186,7 @@ def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:
         present = [name for name in names if name in node]
         if present:
             fields[field] = numbers(node[present[0]], f"{where}: node {present[0]!r}")
-    if "time_offset" in node:
-        fields["time_offset"] = number(node["time_offset"], f"{where}: node 'time_offset'")
+    for field in CLOCK:
+        if field in node:
+            fields[field] = number(node[field], f"{where}: node {field!r}")
     return fields

@@ -171,6 +171,26 @@ def test_a_lens_with_distortion_and_two_focal_lengths_is_undone(ball: World) -> 
     assert max(judged(strokes, times, states)) < 0.08
 
 
+def test_a_rolling_shutter_shows_a_ball_when_its_row_is_read(ball: World) -> None:
+    """What was seen at the same moments gives the same states, whatever the stamps."""
+    times, states = rally(ball)
+    plain, rolling = seen(times, states, 3, hidden=0.0), replace(SIDE, readout=0.016)
+    rows = plain.pixels[np.isclose(plain.scores, 0.9)]
+    frames = plain.frames.copy()
+    frames[: len(rows)] -= rolling.true_times(np.zeros(len(rows)), rows)
+    one, other = (
+        track_one_camera(replace(plain, frames=stamps), camera, ball.model, ball.surfaces)
+        for stamps, camera in ((plain.frames, SIDE), (frames, rolling))
+    )
+    assert len(one.estimates) == len(other.estimates) == 3
+    assert max(judged(other, times, states)) < 0.08
+    for straight, rolled in zip(one.estimates, other.estimates, strict=True):
+        np.testing.assert_allclose(rolled.times, straight.times, atol=1e-9)
+        assert np.abs((rolled.states - straight.states) / straight.sigmas).max() < 1e-6
+    blind = track_one_camera(replace(plain, frames=frames), SIDE, ball.model, ball.surfaces).estimates[0]
+    assert np.abs((blind.states - one.estimates[0].states) / one.estimates[0].sigmas).max() > 0.3
+
+
 def test_a_court_needs_no_ends(ball: World) -> None:
     times, states = rally(ball)
     for ends in (None, (-np.inf, np.inf, -np.inf, np.inf)):

@@ -102,6 +102,10 @@ def shots(count: int, rng: np.random.Generator, every: float = 1.0, lasting: flo
     return made
 
 
+ROLLED = 6
+"""Rounds in which the row and the moment at which it is read agree: each is a hundredth of the one before off."""
+
+
 @dataclass(frozen=True)
 class World:
     """What is filmed, and how."""
@@ -135,9 +139,10 @@ def _filmed(number: int, camera: Camera, world: World) -> Detections:
     rng = np.random.default_rng((world.seed, number))
     period = 1.0 / world.rates[number]
     times = np.arange(world.phases[number] * period, world.duration, period)
-    seen = [shot.at(times) for shot in world.shots] + ([arm(times)] if world.arm else [])
+    seen = [shot.at for shot in world.shots] + ([arm] if world.arm else [])
     frame, pixels = [], []
-    for points in seen:
+    for moving in seen:
+        points = moving(times)
         there = np.isfinite(points).all(axis=1)
         there[there] = camera.in_view(points[there])
         there &= rng.random(len(times)) >= world.missed
@@ -145,7 +150,11 @@ def _filmed(number: int, camera: Camera, world: World) -> Detections:
             start, end = world.blind[number]
             there &= (times < start) | (times > end)
         frame.append(np.flatnonzero(there))
-        pixels.append(camera.project(points[there]) + world.noise * rng.standard_normal((int(there.sum()), 2)))
+        points = points[there]
+        for _ in range(ROLLED if camera.readout else 0):  # a row is seen when it is read, and where the ball then is
+            then = moving(camera.true_times(times[there] + camera.time_offset, camera.project(points)))
+            points = np.where(np.isfinite(then), then, points)
+        pixels.append(camera.project(points) + world.noise * rng.standard_normal((int(there.sum()), 2)))
     frame.append(np.repeat(np.arange(len(times)), world.clutter))
     pixels.append(rng.uniform((0, 0), camera.size, (len(frame[-1]), 2)))
     frames, places = np.concatenate(frame), np.concatenate(pixels)

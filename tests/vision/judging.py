@@ -63,7 +63,7 @@ def _due(number: int, world: World, cameras: Sequence[Camera], films: Sequence[D
     """Stamps of the camera that saw most, at which another saw the ball too or did so shortly before and after."""
     seen = []
     for camera, film in zip(cameras, films, strict=True):
-        times = film.times - camera.time_offset
+        times = camera.true_times(film.times, film.pixels)
         near = np.linalg.norm(camera.project(world.shots[number].at(times)) - film.pixels, axis=1) < 6 * world.noise
         seen.append(np.unique(times[near]))
     stamps = max(seen, key=len)

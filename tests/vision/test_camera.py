@@ -101,6 +101,7 @@ def test_view_ends_at_the_image() -> None:
         ({"size": (0, 720)}, "size must be width and height in pixels; got .*Correct it."),
         ({"name": " "}, "printable text"),
         ({"time_offset": np.inf}, "time_offset must be finite"),
+        ({"readout": 16.0}, "readout must be at most 0.1 s; got 16. It is shorter than a frame; give seconds."),
         ({"covariance": np.eye(6)}, "covariance must have shape"),
         ({"covariance": -np.eye(7)}, "covariance must be symmetric and positive definite"),
     ],
@@ -108,6 +109,17 @@ def test_view_ends_at_the_image() -> None:
 def test_refuses(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message.replace("(", r"\(")):
         camera(**changes)
+
+
+def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other() -> None:
+    rows = np.array([[10.0, 0.0], [900.0, 359.5], [500.0, 719.0]])
+    rolling = camera(0, readout=0.01, time_offset=0.1)
+    np.testing.assert_allclose(
+        rolling.true_times(np.array([1.0, 1.0, 2.0]), rows), [0.895 + 0.005 / 720, 0.9, 1.905 - 0.005 / 720], atol=1e-15
+    )
+    upwards = camera(0, readout=-0.01)
+    assert np.all(np.diff(upwards.true_times(np.ones(3), rows)) < 0.0)
+    assert np.array_equal(camera(0, time_offset=0.1).true_times(np.ones(3), rows), np.ones(3) - 0.1)
 
 
 def test_what_lies_beyond_where_the_lens_turns_back_is_not_seen() -> None:

@@ -22,12 +22,13 @@ def camera(name: str, count: int = 5) -> Camera:
     )
 
 
-RIG = [camera("left"), camera("right", 0), camera("top-2", 14)]
+RIG = [camera("left"), replace(camera("right", 0), readout=-0.012), camera("top-2", 14)]
 
 
 def same(one: Camera, other: Camera) -> bool:
     return (one.name, one.size, one.time_offset) == (other.name, other.size, other.time_offset) and all(
-        np.array_equal(getattr(one, field), getattr(other, field)) for field in ("matrix", "distortion", "rvec", "tvec")
+        np.array_equal(getattr(one, field), getattr(other, field))
+        for field in ("matrix", "distortion", "rvec", "tvec", "readout")
     )
 
 
@@ -125,6 +126,10 @@ GOOD = "size: [1280, 720], matrix: [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]], 
         (
             "cameras: {left: {" + GOOD + "rvec: [0, 0, 0], tvec: [0, 0, 1], time_offset: 4ms}}",
             "time_offset must be a number",
+        ),
+        (
+            "cameras: {left: {" + GOOD + "rvec: [0, 0, 0], tvec: [0, 0, 1], readout: 16 ms}}",
+            "readout must be a number",
         ),
         (
             "cameras: {left: {" + GOOD.replace("[]", "[1]") + "rvec: [0, 0, 0], tvec: [0, 0, 1]}}",

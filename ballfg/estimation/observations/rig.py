@@ -37,12 +37,15 @@ def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera,
 
 
 def true_times_of(sightings: Sightings, cameras: Sequence[Camera]) -> Array:
-    """(m,) s, true times of sightings: stamps less the time offsets of the cameras, in the order of their numbers."""
-    offsets = np.array([camera.time_offset for camera in cameras])
-    return np.asarray(sightings.times - offsets[sightings.camera])
+    """(m,) s, true times of sightings by the clocks and shutters of the cameras, in the order of their numbers."""
+    times = np.zeros(len(sightings))
+    for number, camera in enumerate(cameras):
+        mine = sightings.camera == number
+        times[mine] = camera.true_times(sightings.times[mine], sightings.pixels[mine])
+    return times
 
 
 def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
-    """The sightings in order of true time, by the cameras' time offsets."""
+    """The sightings in order of true time, by the cameras' clocks and shutters."""
     times = true_times_of(sightings, cameras_of(sightings, cameras))
     return sightings.select(np.argsort(times, kind="stable"))

@@ -60,7 +60,7 @@ class SightingStream:
         pixel, covariance = check_array("pixel", pixel, (2,)), check_array("covariance", covariance, (2, 2))
         own, number = self.cameras[camera], list(self.cameras).index(camera)
         row = Sightings(tuple(self.cameras), np.array([number]), np.array([time]), pixel[None], covariance[None])
-        true = float(row.times[0]) - own.time_offset
+        true = float(own.true_times(row.times, row.pixels)[0])
         stamps = self._stamps[camera]
         if true < self._last or (stamps and true <= stamps[-1]):
             raise ValueError(

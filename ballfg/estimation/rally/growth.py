@@ -167,26 +167,35 @@ def all_rated(rays, candidates, scene, view, rows, numbers, vectors, drag, covar
         vectors[k], drag[k], covariance[k] = one.path.vectors, one.path.drag, one.path.covariance
 
 
+@machine_code(NOTHING(SCENE, VIEWED, RATED, REAL, ONE, TWO))
+def _foretell(scene, view, stroke, moment, pixels, spread):
+    """Where a stroke is seen at a moment, s. Writes: pixels (2,) and their covariance (2, 2)."""
+    path, count = stroke.path, len(stroke.path.drag) - 1
+    share, at, slope, wide = np.empty(len(path.vectors)), np.empty(3), np.empty((2, 3)), np.empty((3, 3))
+    drop = share_at(moment, stroke.times, count, path.drag, scene.gravity, share)
+    _place(path.vectors, share, drop, at)
+    _see(view, at, pixels, slope)
+    _spread(path.covariance, share, wide)
+    spread[:] = 0.0
+    for r in range(2):
+        for q in range(2):
+            for a in range(3):
+                for b in range(3):
+                    spread[r, q] += slope[r, a] * wide[a, b] * slope[q, b]
+
+
 @machine_code(COUNTS(RAYS, CANDIDATES, SCENE, VIEWED, several(COUNT, 2), COUNTS, RATED))
 def _met(rays, candidates, scene, view, here, rows, stroke):
     """The rows (n + 1,) of a stroke with the nearest candidate of a picture, rows here[0] to here[1]; (0,) if none."""
     first, end = here
     if first == end:
         return np.empty(0, dtype=np.int64)
-    path, count = stroke.path, len(stroke.path.drag) - 1
-    share, at, slope, pixels = np.empty(len(path.vectors)), np.empty(3), np.empty((2, 3)), np.empty(2)
-    wide, spread = np.empty((3, 3)), np.zeros((2, 2))
-    drop = share_at(rays[first].time, stroke.times, count, path.drag, scene.gravity, share)
-    _place(path.vectors, share, drop, at)
-    _see(view, at, pixels, slope)
-    _spread(path.covariance, share, wide)
-    for r in range(2):
-        for q in range(2):
-            for a in range(3):
-                for b in range(3):
-                    spread[r, q] += slope[r, a] * wide[a, b] * slope[q, b]
+    pixels, spread, moment = np.empty(2), np.empty((2, 2)), math.nan
     best, nearest = -1, GATE
     for row in range(first, end):
+        if rays[row].time != moment:  # a rolling shutter sees each row at a time of its own
+            moment = rays[row].time
+            _foretell(scene, view, stroke, moment, pixels, spread)
         one = candidates[row]
         x, y = one.pixels[0] - pixels[0], one.pixels[1] - pixels[1]
         xx, yy = one.covariance[0, 0] + spread[0, 0], one.covariance[1, 1] + spread[1, 1]

@@ -179,12 +179,13 @@ def search(
         return NOTHING, None
     flat, pinhole = without_lens(replace(seen, frames=elapsed(seen.frames, float(seen.frames[0]))), camera)
     scale, fall = at_court(pinhole, surfaces)
+    times = replace(camera, time_offset=0.0).true_times(flat.times, seen.pixels)
     seeds, plain, foretold = arcs(replace(Field.of(flat, scale, seen_share, fall), play=play))
     density = foretold.density(np.zeros(0, dtype=np.int64))  # with the ball, which is not known yet
     chosen = NOTHING
     for _ in range(ROUNDS):
         field = plain.smooth(density)
-        grower = Grower.of(field, flat.times, pinhole, physics_of(model), surfaces)
+        grower = Grower.of(field, times, pinhole, physics_of(model), surfaces)
         chosen = rally(grower, seeds, chosen.strokes, watch)
         if not chosen.strokes:
             break

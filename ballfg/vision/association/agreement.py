@@ -109,7 +109,9 @@ def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
         for k, camera in enumerate(cameras):
             mine = own.camera == own.cameras.index(camera.name)
             if mine.any():
-                line = path(own.times[mine] - camera.time_offset, own.pixels[mine], own.covariances[mine])
+                line = path(
+                    camera.true_times(own.times[mine], own.pixels[mine]), own.pixels[mine], own.covariances[mine]
+                )
                 pixels[start:end, k], covariances[start:end, k] = line.at(ball.times)
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     rows = np.flatnonzero(seen.sum(axis=1) >= 3)

@@ -126,8 +126,8 @@ def _may_follow(footage: gathering.Footage, one: gathering.Gathered, other: gath
 def _seen_ball(footage: gathering.Footage, ball: gathering.Gathered) -> gathering.SeenBall:
     camera = np.repeat(np.arange(len(ball.rows)), [len(rows) for rows in ball.rows])
     pairs = list(zip(footage.detections, ball.rows, strict=True))
-    since = np.concatenate([seen.times[rows] for seen, rows in pairs])
-    order = np.argsort(since - np.array([c.time_offset for c in footage.cameras])[camera], kind="stable")
+    since = np.concatenate([footage.times(number, rows) for number, rows in enumerate(ball.rows)])
+    order = np.argsort(since, kind="stable")
     stamps = np.concatenate([own[seen.frame[rows]] for own, (seen, rows) in zip(footage.stamps, pairs, strict=True)])
     pixels = np.concatenate([seen.pixels[rows] for seen, rows in pairs])
     spread = np.concatenate([seen.covariances[rows] for seen, rows in pairs])

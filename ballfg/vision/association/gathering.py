@@ -39,13 +39,18 @@ class Footage:
     offset: float = 0.0  # px, error of the calibration, added to every pixel's noise
 
     def frames(self, camera: int) -> Array:
-        """(f,) s, true times of a camera's frames."""
+        """(f,) s, true times of a camera's frames, in their middle rows."""
         return np.asarray(self.detections[camera].frames - self.cameras[camera].time_offset)
+
+    def times(self, camera: int, rows: Index) -> Array:
+        """(n,) s, true times of candidates of one camera."""
+        seen = self.detections[camera]
+        return self.cameras[camera].true_times(seen.times[rows], seen.pixels[rows])
 
     def path(self, camera: int, rows: Index) -> Path:
         """Candidates of one camera as a path over true time."""
         seen = self.detections[camera]
-        return path(self.frames(camera)[seen.frame[rows]], seen.pixels[rows], seen.covariances[rows])
+        return path(self.times(camera, rows), seen.pixels[rows], seen.covariances[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +161,7 @@ def _wanted(footage: Footage, ball: Gathered, taken: Sequence[Mask]) -> list[Ind
         near = (frames >= ball.track.times[0] - ahead) & (frames <= ball.track.times[-1] + ahead)
         near[seen.frame[ball.rows[number]]] = False
         free = np.flatnonzero(near[seen.frame] & ~taken[number])
-        pixels, spread = _predicted(camera, ball, frames[seen.frame[free]])
+        pixels, spread = _predicted(camera, ball, footage.times(number, free))
         spread = spread + seen.covariances[free] + (footage.offset**2 + _SYSTEMATIC**2) * np.eye(2)
         sure = np.asarray(np.isfinite(pixels).all(axis=1))
         sure[sure] = np.trace(spread[sure], axis1=1, axis2=2) <= 2.0 * _WIDEST**2

@@ -77,11 +77,12 @@ class Scene(NamedTuple):
 def seen(
     states: np.ndarray, camera: np.ndarray, times: np.ndarray, rng: np.random.Generator, rig: Sequence[Camera] = RIG
 ) -> Scene:
-    """Sightings of states at ascending true times, each by its camera, with noise; stamps are late as `rig` says."""
+    """Sightings of states at ascending true times, each by its camera, with noise, with the stamps of its clock."""
     pixels = np.stack([rig[c].project(x[:3]) for c, x in zip(camera, states, strict=True)])
     inside = np.array([bool(rig[c].in_view(x[:3])) for c, x in zip(camera, states, strict=True)])
     pixels = pixels + NOISE * rng.standard_normal(pixels.shape)
-    late = np.array([c.time_offset for c in rig])[camera]
+    pairs = zip(camera, times, pixels, strict=True)
+    late = times - np.array([rig[c].true_times(np.array([t]), z[None])[0] for c, t, z in pairs])
     noise = np.tile(NOISE**2 * np.eye(2), (len(times), 1, 1))
     names = tuple(c.name for c in rig)
     return Scene(Sightings(names, camera, times + late, pixels, noise).select(inside), states[inside])

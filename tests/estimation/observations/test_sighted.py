@@ -89,6 +89,17 @@ def test_one_camera_alone_still_gives_states(ball: World) -> None:
     assert np.abs(error[:, :3]).max() < 2e-3
 
 
+def test_rows_of_rolling_shutters_are_seen_one_after_the_other(ball: World) -> None:
+    """What was seen at the same moments gives the same states, whatever the stamps."""
+    rolling = tuple(replace(camera, readout=readout) for camera, readout in zip(RIG, (0.012, -0.007, 0.0), strict=True))
+    plain, made = scene(2, ball), scene(2, ball, rig=rolling)
+    assert np.abs(made.sightings.times - plain.sightings.times).max() > 1e-3
+    tracks = track_of(plain), track_of(made, cameras=rolling)
+    one, other = (smoother(ball).estimate(track) for track in tracks)
+    np.testing.assert_allclose(other.times, one.times, atol=1e-12)
+    np.testing.assert_allclose(other.states, one.states, rtol=1e-6, atol=1e-6)
+
+
 def test_between_takes_the_sightings_along(made: Scene) -> None:
     part = track_of(made).between(0.1, 0.2)
     seen = sightings_of(part)

@@ -55,6 +55,18 @@ def test_final_estimate_is_the_smoothers(ball: World, seed: int, phases: tuple[f
     assert online.whitened.shape == (len(track.observations[0]), 2)
 
 
+def test_rows_of_rolling_shutters_are_pushed_when_they_were_seen(ball: World) -> None:
+    rolling = tuple(replace(camera, readout=readout) for camera, readout in zip(RIG, (0.012, -0.007, 0.0), strict=True))
+    found = []
+    for rig in (RIG, rolling):
+        online = Online(ball.model, ball.surfaces, Settings(), cameras=rig)
+        found.append([state for state in pushed(online, scene(1, ball, duration=0.3, rig=rig)) if state is not None])
+    assert len(found[0]) == len(found[1]) > 20
+    for one, other in zip(*found, strict=True):
+        assert other.time == pytest.approx(one.time, abs=1e-12)
+        np.testing.assert_allclose(other.state, one.state, rtol=1e-6, atol=1e-6)
+
+
 def test_innovations_are_as_large_as_stated(ball: World) -> None:
     """Chi-square of 2 degrees: mean 2, median 2 ln 2. Both of n numbers scatter by 2 / sqrt(n): three times that."""
     exact = Settings(process=ProcessNoise(acceleration=0.01, spin=0.1, contact_velocity=0.01, contact_spin=0.1))

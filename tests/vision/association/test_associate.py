@@ -54,6 +54,18 @@ def test_time_offsets_are_taken_off_the_stamps() -> None:
     assert sightings.times[sightings.camera == 2].max() < 0.0  # as the camera wrote them
 
 
+def test_rows_of_rolling_shutters_are_seen_one_after_the_other() -> None:
+    world = World(two_at_once(2, 6), 2.4, seed=6)
+    rolling = [
+        replace(camera, readout=readout) for camera, readout in zip(CAMERAS, (0.014, 0.014, -0.010), strict=True)
+    ]
+    films = film(rolling, world)
+    verdict = judge(associate(films, rolling), world, rolling, films)
+    assert verdict.rmse < 0.0011
+    assert (verdict.balls, verdict.false, verdict.mixed) == ([1, 1, 1, 1], 0, 0)
+    assert judge(associate(films, CAMERAS), world, rolling, films).rmse > 2.0 * verdict.rmse
+
+
 def test_survives_a_camera_turned_by_half_a_degree() -> None:
     world = World(two_at_once(2, 8), 2.4, seed=8)
     films = film(CAMERAS, world)
