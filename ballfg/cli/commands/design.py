@@ -1,9 +1,10 @@
-"""Implements `ballfg design`, which chooses the next shots."""
+"""Implements `ballfg design`, which chooses the next shots, or the place of a camera."""
 
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -17,12 +18,22 @@ if TYPE_CHECKING:
     from ballfg.dynamics import AnalyticModel
     from ballfg.tracks import Dataset
 
+SHOWN: Final = 20  # Places that are printed
+
 
 def design(
     dataset: inputs.DatasetFolder,
     candidates: Annotated[
-        str, typer.Option(help="Launcher settings to choose from, as topspin=-3..5,speed=8..14 or wheel=900..1500:100.")
-    ],
+        str | None,
+        typer.Option(help="Launcher settings to choose from, as topspin=-3..5,speed=8..14 or wheel=900..1500:100."),
+    ] = None,
+    stand: Annotated[
+        str | None, typer.Option(help="Places (m) of one camera to choose from, as x=-4..4:2,y=-5..-3,z=1..3.")
+    ] = None,
+    cameras: Annotated[
+        Path | None, typer.Option(help="With --stand: file of the camera, whose lens counts, not its place.")
+    ] = None,
+    noise: Annotated[float, typer.Option(help="With --stand: noise of the ball's place in the picture, px.")] = 0.5,
     model: inputs.ModelFile = None,
     between: Annotated[
         str | None, typer.Option(help="Two effects to tell apart, as frame_tilt,table_tilt or wind.x,drag.k.")
@@ -39,13 +50,21 @@ def design(
     observations_file: inputs.ObservationsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
 ) -> None:
-    """Choose the launcher's next shots: those that best tell two effects apart, or shrink an error bar most.
+    """Choose the launcher's next shots, those that best tell two effects apart; or where one camera should stand.
 
     The settings are columns of the dataset's labels.csv, whose tracks teach what they do. Printed are the
     shots in order, the standard deviations to expect after each, and what as many random shots would bring.
 
     Example: ballfg design shots --candidates topspin=-3..5,sidespin=-5..5,speed=8..14 --between wind.x,drag.k
+
+    Example: ballfg design shots --stand x=-4..4:2,y=-5..-3,z=1..3 --cameras lens.yaml
     """
+    if stand is not None or candidates is None:
+        shots_only = {"candidates": candidates, "between": between, "shrink": shrink, "diagnosis": diagnosis}
+        _stand(dataset, stand, cameras, noise, model, out, jobs, **shots_only)
+        return
+    if cameras is not None:
+        raise ValueError("--cameras is for --stand. Leave it out.")
     from ballfg.diagnosis.design.levels import parse_levels
     from ballfg.diagnosis.design.plan import check_labels, design_shots
     from ballfg.dynamics import AnalyticModel
@@ -84,6 +103,55 @@ def design(
         with TableWriter(out) as table:
             table.write(columns)
         print(f"{out}: {len(plan.settings)} shots")
+
+
+def _stand(
+    dataset: Path,
+    stand: str | None,
+    cameras: Path | None,
+    noise: float,
+    model: Path | None,
+    out: Path | None,
+    jobs: int,
+    **shots_only: object,
+) -> None:
+    """Prints how well a camera would know the strokes of a dataset from each place. Raises: ValueError: options."""
+    from ballfg.diagnosis.design.levels import combinations, parse_levels
+    from ballfg.diagnosis.design.stand import where_to_stand
+    from ballfg.tracks import TableWriter
+    from ballfg.vision.camera_file import read_cameras
+
+    if stand is None:
+        raise ValueError("--candidates or --stand must be given; got neither. Say what to choose from.")
+    for name, value in shots_only.items():
+        if value is not None:
+            raise ValueError(f"--{name} is for shots, --stand for a camera. Leave one of them out.")
+    levels = parse_levels(stand, "--stand")
+    if sorted(levels) != ["x", "y", "z"]:
+        raise ValueError(f"--stand must name x, y and z; got {', '.join(levels)}. Write x=-4..4:2,y=-5..-3,z=1..3.")
+    if cameras is None:
+        raise ValueError("--stand needs --cameras, a file with the lens of the camera. Give one.")
+    (lens, *others) = read_cameras(cameras, posed=False)
+    if others:
+        raise ValueError(f"{cameras} must hold one camera for --stand; it holds {1 + len(others)}. Give one.")
+    if out is not None:
+        TableWriter(out)  # refuses a path that cannot be written
+        inputs.check_out(out, dataset)
+    opened = inputs.open_inputs(dataset, model, None)
+    places = combinations({axis: levels[axis] for axis in "xyz"})
+    found = where_to_stand(opened.dataset, opened.model, lens, places, noise=noise, jobs=jobs)
+    print(f"{lens.name} at {len(found)} places, best first: median error of the ball's place, strokes seen,")
+    print("strokes seen whose depth is uncertain")
+    for one in found[:SHOWN]:
+        place = " ".join(f"{axis}={value:<6g}" for axis, value in zip("xyz", one.place, strict=True))
+        error = f"{1e3 * one.sigma:6.0f} mm" if math.isfinite(one.sigma) else "not seen"
+        print(f"{place} {error:>9}  {100 * one.seen:3.0f} %  {100 * one.uncertain:3.0f} %")
+    if out is not None:
+        columns = {axis: [one.place[i] for one in found] for i, axis in enumerate("xyz")}
+        columns |= {name: [getattr(one, name) for one in found] for name in ("sigma", "seen", "uncertain")}
+        with TableWriter(out) as table:
+            table.write(columns)
+        print(f"{out}: {len(found)} places")
 
 
 def _say(line: str) -> None:

@@ -1,0 +1,111 @@
+"""Tells where one camera should stand: how well it would know strokes from each of many places.
+
+The strokes are those of a dataset. From each place they are filmed without noise and estimated from these sightings
+alone; the standard deviations of such an estimate are those to expect there, since they hold.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.checks import check_array, check_number
+from ballfg.dynamics import BallModel, Surfaces
+from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, sighted_track
+from ballfg.estimation.batch import do_all, map_tracks
+from ballfg.estimation.noise.estimate import spread_over
+from ballfg.estimation.observations.sightings import LEAST_SEEN
+from ballfg.simulation.cameras import looking_at
+from ballfg.state import POSITION
+from ballfg.tracks import Dataset
+from ballfg.tracks.sightings import Sightings
+from ballfg.vision import Camera
+
+STROKES: Final = 20  # Of a dataset, evenly over it, that are filmed from each place
+NOISE: Final = 0.5  # px
+
+
+@dataclass(frozen=True)
+class Stand:
+    """What a camera at a place, which looks at the middle of the strokes, would tell of them.
+
+    Attributes:
+        place: (x, y, z) m.
+        sigma: m, median over strokes of the root mean square standard deviation of the ball's place; inf where most
+            are not seen.
+        seen: share of strokes that it sees often enough.
+        uncertain: share of the seen ones whose depth is called uncertain.
+    """
+
+    place: tuple[float, float, float]
+    sigma: float
+    seen: float
+    uncertain: float
+
+
+def where_to_stand(
+    dataset: Dataset, model: BallModel, lens: Camera, places: Array, *, noise: float = NOISE, jobs: int = 1
+) -> list[Stand]:
+    """How well one camera would know the strokes of a dataset from each place, the best place first.
+
+    Args:
+        dataset: strokes, up to `STROKES` of which are filmed at their own stamps.  model: of the ball.
+        lens: a camera whose place does not count.  places: (n, 3) m.  noise: px, of each coordinate of a sighting.
+    Raises: ValueError: places of another shape or above the middle of the strokes, or no stroke that is estimated.
+    """
+    places = check_array("places", places, remedy="Give a row x, y, z (m) for each place.")
+    if places.ndim != 2 or places.shape[1] != 3 or not len(places):
+        raise ValueError(f"places must have shape (n, 3), n at least 1; got {places.shape}. Give x, y, z in m.")
+    if not check_number("noise", noise, "px") > 0.0:
+        raise ValueError(f"noise must be positive; got {noise:g} px. Give that of your detector.")
+    surfaces = dataset_surfaces(dataset)
+    smoother = Smoother(model, surfaces, dataset_settings(dataset, model))
+    tracks = list(spread_over(iter(dataset), len(dataset), STROKES))
+    flown = [one for one in map_tracks(smoother.estimate, tracks, len(tracks), jobs) if one.status is Status.OK]
+    if not flown:
+        raise ValueError("dataset must hold a stroke whose estimate is sure; it holds none. Look at 'ballfg estimate'.")
+    target = np.median(np.concatenate([one.states[:, POSITION] for one in flown]), axis=0)
+    asked = [partial(_stand, place, _turned(lens, place, target), flown, model, surfaces, noise) for place in places]
+    stands = do_all(asked, jobs)
+    return sorted(stands, key=lambda one: one.sigma)
+
+
+def _turned(lens: Camera, place: Array, target: Array) -> Camera:
+    """A camera with a lens at a place, level, its principal point on a target."""
+    pose = looking_at(lens.name, place, target, 1.0, lens.size)
+    return replace(lens, rvec=pose.rvec, tvec=pose.tvec, covariance=None)
+
+
+def _stand(
+    place: Array, camera: Camera, flown: Sequence[Estimate], model: BallModel, surfaces: Surfaces, noise: float
+) -> Stand:
+    """What a camera at a place tells of strokes."""
+    smoother, sigmas, uncertain = Smoother(model, surfaces, Settings.for_measured(model)), list[float](), 0
+    for one in flown:
+        found = _seen(smoother, camera, one, noise)
+        if found is not None:
+            uncertain += found.status is Status.DEPTH_UNCERTAIN
+            spread = np.trace(found.covariances[:, POSITION, POSITION], axis1=1, axis2=2)
+            sigmas.append(float(np.sqrt(spread.mean())))
+    every = np.append(sigmas, np.full(len(flown) - len(sigmas), np.inf))
+    x, y, z = place.tolist()
+    seen = len(sigmas) / len(flown)
+    return Stand((x, y, z), float(np.median(every)), seen, uncertain / len(sigmas) if sigmas else 0.0)
+
+
+def _seen(smoother: Smoother, camera: Camera, flown: Estimate, noise: float) -> Estimate | None:
+    """The estimate of a stroke from what a camera sees of it; None if that is too little."""
+    positions = flown.states[:, POSITION]
+    (rows,) = np.nonzero(camera.in_view(positions))
+    if len(rows) < LEAST_SEEN:
+        return None
+    times, pixels = flown.times[rows], camera.project(positions[rows])
+    stamps = 2.0 * times - camera.true_times(times, pixels)
+    own = (np.zeros(len(rows), dtype=np.int64), stamps, pixels, np.tile(noise**2 * np.eye(2), (len(rows), 1, 1)))
+    bounces = np.array([contact.time for contact in flown.contacts if times[0] < contact.time < times[-1]])
+    given = {"model": smoother.model, "surfaces": smoother.surfaces, "bounces": bounces}
+    estimate = smoother.estimate(sighted_track(flown.name, Sightings((camera.name,), *own), [camera], **given))
+    return estimate if estimate.status in (Status.OK, Status.DEPTH_UNCERTAIN) else None
