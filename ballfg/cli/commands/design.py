@@ -61,7 +61,8 @@ def design(
     """
     if stand is not None or candidates is None:
         shots_only = {"candidates": candidates, "between": between, "shrink": shrink, "diagnosis": diagnosis}
-        _stand(dataset, stand, cameras, noise, model, out, jobs, **shots_only)
+        inputs.know_observations(observations_file)
+        _stand(dataset, stand, cameras, noise, model, effects_file, out, jobs, **shots_only)
         return
     if cameras is not None:
         raise ValueError("--cameras is for --stand. Leave it out.")
@@ -111,6 +112,7 @@ def _stand(
     cameras: Path | None,
     noise: float,
     model: Path | None,
+    effects_file: list[Path] | None,
     out: Path | None,
     jobs: int,
     **shots_only: object,
@@ -137,11 +139,10 @@ def _stand(
     if out is not None:
         TableWriter(out)  # refuses a path that cannot be written
         inputs.check_out(out, dataset)
-    opened = inputs.open_inputs(dataset, model, None)
+    opened = inputs.open_inputs(dataset, model, effects_file)
     places = combinations({axis: levels[axis] for axis in "xyz"})
     found = where_to_stand(opened.dataset, opened.model, lens, places, noise=noise, jobs=jobs)
-    print(f"{lens.name} at {len(found)} places, best first: median error of the ball's place, strokes seen,")
-    print("strokes seen whose depth is uncertain")
+    print(f"{lens.name} at {len(found)} places, best first: median error; strokes seen; of these, uncertain in depth")
     for one in found[:SHOWN]:
         place = " ".join(f"{axis}={value:<6g}" for axis, value in zip("xyz", one.place, strict=True))
         error = f"{1e3 * one.sigma:6.0f} mm" if math.isfinite(one.sigma) else "not seen"

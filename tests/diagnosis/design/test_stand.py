@@ -100,7 +100,7 @@ def test_the_command_prints_and_writes_places(
     assert status(*words, "--stand", "z=1.0..2.0,x=0,y=-4", "--out", tmp_path / "places.csv") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("phone at 2 places, best first")
-    assert said[2].split()[:3] == ["x=0", "y=-4", "z=2"]
+    assert said[1].split()[:3] == ["x=0", "y=-4", "z=2"]
     assert (tmp_path / "places.csv").read_text().splitlines()[0] == "x,y,z,sigma,seen,uncertain"
     for bad, message in (
         (("--stand", "x=0,y=-4"), "--stand must name x, y and z; got x, y. Write x=-4..4:2"),
