@@ -26,7 +26,8 @@ PLACE: Final = ("t", "u", "v")
 NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
 SCORE: Final = "score"
 RADIUS: Final = ("radius", "sigma_radius")
-OPTIONAL: Final = (*NOISE, *RADIUS, SCORE)
+STREAK: Final = ("streak_u", "streak_v")
+OPTIONAL: Final = (*NOISE, *RADIUS, *STREAK, SCORE)
 UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}  # px; half a pixel, as of patch centres
 LEAST_SIGMA: Final = 1e-4  # px, best resolution of a camera; far surer pixels cannot be solved in double precision
 MOST_PIXELS: Final = 1e6  # px. Largest width of an image; larger numbers overflow when squared.
@@ -40,6 +41,8 @@ RULES: Final[Mapping[str, Rule]] = {
     "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
     "radius": (f"0 (unknown) to {MOST_PIXELS:.0f} px", lambda x: (x >= 0.0) & (x <= MOST_PIXELS)),
     "sigma_radius": _SIGMA,
+    "streak_u": _PIXEL,
+    "streak_v": _PIXEL,
 }
 DETECTIONS_FILE: Final = "detections.csv"
 EVENTS_FILE: Final = "events.csv"  # hits, bounces and ends of the same balls, where one camera saw them
@@ -59,7 +62,7 @@ def read_sightings(
     Args:
         path: a table `trajectory,t,camera,u,v` (t in s, as recorded by the camera, u and v in px), optionally with
             `sigma_u`, `sigma_v` (px), `rho_uv`, `radius` of the ball in the picture (px; 0: unknown), `sigma_radius`
-            (px) and `score`.
+            (px), `streak_u` and `streak_v` from one end of its streak to the other (px; 0: unknown), and `score`.
         time_offsets: s, by camera of the rig: rows are sorted by t less the offset.
     Returns: sightings by trajectory, in the order in which the trajectories first appear; ignored entries, one sentence
         each.
@@ -92,7 +95,8 @@ def read_sightings(
         own = {column: cells[mine] for column, cells in values.items()}
         pixels = np.column_stack((own["u"], own["v"]))
         radii = _radii(own) if RADIUS[0] in own else None
-        found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, covariances(own), radii)
+        streaks = streaks_of(own) if any(one in own for one in STREAK) else None
+        found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, covariances(own), radii, streaks)
     return found, notes
 
 
@@ -213,11 +217,23 @@ def _radii(values: Mapping[str, Array]) -> Array:
     return np.stack((radius, values.get(RADIUS[1], np.full_like(radius, UNSTATED["sigma_u"]))), axis=1)
 
 
-def seen_columns(times: Array, camera: ArrayLike, pixels: Array, spread: Array) -> dict[str, ArrayLike]:
-    """The columns of a table from stamps (n,) s, cameras, pixels (n, 2) and covariances (n, 2, 2) px^2."""
+def streaks_of(values: Mapping[str, Array]) -> Array:
+    """(n, 2) px, from one end of the ball's streak to the other; 0 where a table has none."""
+    (count,) = {len(column) for column in values.values()}
+    return np.stack([values.get(name, np.zeros(count)) for name in STREAK], axis=1)
+
+
+def seen_columns(
+    times: Array, camera: ArrayLike, pixels: Array, spread: Array, ends: Array | None = None
+) -> dict[str, ArrayLike]:
+    """The columns of a table from stamps (n,) s, cameras, pixels (n, 2) and covariances (n, 2, 2) px^2.
+
+    Args: ends: (n, 2, 2) px, of streaks, NaN where there are none; None: without their columns.
+    """
+    way = {} if ends is None else dict(zip(STREAK, np.nan_to_num(ends[:, 1] - ends[:, 0]).T, strict=True))
     sigma_u, sigma_v = (np.sqrt(spread[:, i, i]) for i in (0, 1))
     noise = {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": spread[:, 0, 1] / (sigma_u * sigma_v)}
-    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise}
+    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise, **way}
 
 
 def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:

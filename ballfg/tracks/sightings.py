@@ -29,6 +29,8 @@ class Sightings:
     covariances: Array  # (m, 2, 2) px^2
     radii: Array | None = None
     """(m, 2) px, radius of the ball in the picture, 0 where unknown, and its standard deviation; None: all unknown."""
+    streaks: Array | None = None
+    """(m, 2) px, from one end of the ball's streak to the other, either way, 0 where unknown; None: all unknown."""
 
     def __post_init__(self) -> None:
         check_iterable("cameras", self.cameras)
@@ -53,14 +55,7 @@ class Sightings:
                 row = int(np.argwhere(~np.isfinite(array))[0][0])
                 raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
             object.__setattr__(self, field, array)
-        if self.radii is not None:
-            radii = check_array("radii", self.radii, (m, 2), "Pass one row per sighting.")
-            good = np.isfinite(radii).all(axis=1) & (radii[:, 0] >= 0.0) & (radii[:, 1] > 0.0)
-            if not good.all():
-                row = int(np.argmin(good))
-                problem = f"radii must be a radius and a sigma above zero, in px; radii[{row}]={radii[row].tolist()}"
-                raise ValueError(f"{problem}. Give 0 for an unknown radius.")
-            object.__setattr__(self, "radii", radii)
+        self._check_cues(m)
         for number, name in enumerate(self.cameras):
             rows = np.flatnonzero(self.camera == number)
             wrong = np.flatnonzero(np.diff(self.times[rows]) <= 0.0)
@@ -78,15 +73,32 @@ class Sightings:
                 f"{self.covariances[row].tolist()}. Give the variance of u and v in px^2."
             )
 
+    def _check_cues(self, m: int) -> None:
+        """Checks radii and streaks of m sightings. Raises: ValueError."""
+        if self.radii is not None:
+            radii = check_array("radii", self.radii, (m, 2), "Pass one row per sighting.")
+            good = np.isfinite(radii).all(axis=1) & (radii[:, 0] >= 0.0) & (radii[:, 1] > 0.0)
+            if not good.all():
+                row = int(np.argmin(good))
+                problem = f"radii must be a radius and a sigma above zero, in px; radii[{row}]={radii[row].tolist()}"
+                raise ValueError(f"{problem}. Give 0 for an unknown radius.")
+            object.__setattr__(self, "radii", radii)
+        if self.streaks is not None:
+            streaks = check_array("streaks", self.streaks, (m, 2), "Pass one row per sighting.")
+            if not np.isfinite(streaks).all():
+                row = int(np.argwhere(~np.isfinite(streaks))[0][0])
+                raise ValueError(f"streaks must be finite; streaks[{row}]={streaks[row].tolist()}. Give 0 for unknown.")
+            object.__setattr__(self, "streaks", streaks)
+
     def __len__(self) -> int:
         return len(self.times)
 
     def select(self, rows: ArrayLike) -> "Sightings":
         """The rows of the numbers (k,), ascending, or of the mask (m,) bool. Raises: ValueError: if none remains."""
         kept = np.asarray(rows)
-        radii = None if self.radii is None else self.radii[kept]
+        cues = (None if cue is None else cue[kept] for cue in (self.radii, self.streaks))
         own = (self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
-        return Sightings(self.cameras, *own, radii)
+        return Sightings(self.cameras, *own, *cues)
 
 
 def are_covariances(matrices: Array) -> NDArray[np.bool_]:

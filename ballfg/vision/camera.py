@@ -15,7 +15,7 @@ DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
 _PRECISELY: Final = (3, 60, 1e-12)  # cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 """OpenCV undoes distortion by five steps of a fixed point by default: 0.1 pixel off in a wide lens."""
-LONGEST_READOUT: Final = 0.1  # s, of all rows of an image
+LONGEST: Final = 0.1  # s, of an exposure, and until all rows of an image are read
 WIDEST_ASKED: Final = 6.0  # tangent of the angle from the axis up to which a lens is tested: 80 degrees
 WIDEST_STEPS: Final = 6001
 
@@ -52,6 +52,8 @@ class Camera:
     readout: float = 0.0
     """s from the exposure of the first row to that of the last, of a rolling shutter; below 0 if the last is first. A
     stamp is that of the middle row."""
+    exposure: float = 0.0
+    """s, for which the shutter is open, a stamp its middle: a streak's ends are where the ball was then; 0: unknown."""
 
     def __post_init__(self) -> None:
         check_name("a camera's name", self.name)
@@ -82,10 +84,12 @@ class Camera:
         if self.covariance is not None:
             object.__setattr__(self, "covariance", _checked_covariance(where, self.covariance))
         object.__setattr__(self, "time_offset", check_number(f"{where}: time_offset", self.time_offset, "s"))
-        object.__setattr__(self, "readout", check_number(f"{where}: readout", self.readout, "s"))
-        if abs(self.readout) > LONGEST_READOUT:
-            rule = f"{where}: readout must be at most {LONGEST_READOUT:g} s; got {self.readout:g}"
-            raise ValueError(f"{rule}. It is shorter than a frame; give seconds.")
+        for field, least in (("readout", -LONGEST), ("exposure", 0.0)):
+            seconds = check_number(f"{where}: {field}", getattr(self, field), "s")
+            if not least <= seconds <= LONGEST:
+                rule = f"{where}: {field} must be {least:g} to {LONGEST:g} s; got {seconds:g}"
+                raise ValueError(f"{rule}. It is shorter than a frame; give seconds.")
+            object.__setattr__(self, field, seconds)
 
     @cached_property
     def rotation(self) -> Array:

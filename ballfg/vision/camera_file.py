@@ -19,7 +19,7 @@ from ballfg.vision.camera import Camera
 CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
-CLOCK: Final = ("time_offset", "readout")
+CLOCK: Final = ("time_offset", "readout", "exposure")
 FIELDS: Final = (*LENS, *POSE, *CLOCK, "covariance")  # in the file's order; docs/calibrate.md explains them
 
 _MATRIX: Final = "camera_matrix"
@@ -132,8 +132,8 @@ def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _stated(camera: Camera, fields: Sequence[str]) -> dict[str, Any]:
-    """The fields that a file states: no covariance of an exact camera, no readout of one that sees all rows at once."""
-    absent = {"covariance": camera.covariance is None, "readout": camera.readout == 0.0}
+    """The fields that a file states: no covariance of an exact camera, no readout or exposure where it is not known."""
+    absent = {"covariance": camera.covariance is None, "readout": not camera.readout, "exposure": not camera.exposure}
     return {field: np.asarray(getattr(camera, field)).tolist() for field in fields if not absent.get(field, False)}
 
 

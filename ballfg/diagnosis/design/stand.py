@@ -106,6 +106,7 @@ def _seen(smoother: Smoother, camera: Camera, flown: Estimate, noise: float) -> 
     stamps = 2.0 * times - camera.true_times(times, pixels)
     own = (np.zeros(len(rows), dtype=np.int64), stamps, pixels, np.tile(noise**2 * np.eye(2), (len(rows), 1, 1)))
     bounces = np.array([contact.time for contact in flown.contacts if times[0] < contact.time < times[-1]])
-    given = {"model": smoother.model, "surfaces": smoother.surfaces, "bounces": bounces}
-    estimate = smoother.estimate(sighted_track(flown.name, Sightings((camera.name,), *own), [camera], **given))
+    seen, model, surfaces = Sightings((camera.name,), *own), smoother.model, smoother.surfaces
+    track = sighted_track(flown.name, seen, [camera], model=model, surfaces=surfaces, bounces=bounces)
+    estimate = smoother.estimate(track)
     return estimate if estimate.status in (Status.OK, Status.DEPTH_UNCERTAIN) else None

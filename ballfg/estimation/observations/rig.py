@@ -45,6 +45,47 @@ def true_times_of(sightings: Sightings, cameras: Sequence[Camera]) -> Array:
     return times
 
 
+def with_ends(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
+    """The sightings with both ends of each streak, as the shutter opened and closed, in place of its middle.
+
+    Either end has twice the variance of the middle, which is their mean. The motion from the sighting before and to
+    the one after tells which end is first; where they differ, as at a hit, the middle stays.
+
+    Args: cameras: in the order of their numbers; those without a known exposure show no ends.
+    Raises: ValueError: an exposure that is longer than the time between two sightings.
+    """
+    if sightings.streaks is None:
+        return sightings
+    way = np.zeros((len(sightings), 2))
+    for number, camera in enumerate(cameras):
+        rows = np.flatnonzero(sightings.camera == number)
+        if camera.exposure > 0.0 and len(rows) > 1:
+            steps = np.diff(sightings.times[rows])
+            if steps.min() <= camera.exposure:
+                raise ValueError(
+                    f"camera {shown(camera.name)}: exposure must be shorter than the {steps.min():g} s between two "
+                    f"sightings; got {camera.exposure:g} s. Correct it in cameras.yaml."
+                )
+            way[rows] = _forward(sightings.streaks[rows], np.diff(sightings.pixels[rows], axis=0))
+    long = np.linalg.norm(way, axis=1) > 0.0
+    rows, half = np.repeat(np.arange(len(long)), 1 + long), np.array([camera.exposure for camera in cameras]) / 2.0
+    end = np.zeros(len(rows))  # -1 and 1 for the ends, 0 for a middle
+    end[np.append(False, rows[1:] == rows[:-1])] = 1.0
+    end[np.append(rows[1:] == rows[:-1], False)] = -1.0
+    times = sightings.times[rows] + end * half[sightings.camera[rows]]
+    pixels = sightings.pixels[rows] + 0.5 * end[:, None] * way[rows]
+    spread = sightings.covariances[rows] * np.where(end == 0.0, 1.0, 2.0)[:, None, None]
+    radii = None if sightings.radii is None else sightings.radii[rows]
+    return Sightings(sightings.cameras, sightings.camera[rows], times, pixels, spread, radii)
+
+
+def _forward(streaks: Array, moved: Array) -> Array:
+    """Streaks (n, 2) px along the motions (n - 1, 2) px between them; 0 where these do not tell which way."""
+    sides = np.concatenate((moved[:1], moved)), np.concatenate((moved, moved[-1:]))  # before, and after
+    ways = [np.sign((streaks * side).sum(axis=1)) for side in sides]
+    return np.asarray(streaks * np.where(ways[0] == ways[1], ways[0], 0.0)[:, None])
+
+
 def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
     """The sightings in order of true time, by the cameras' clocks and shutters."""
     times = true_times_of(sightings, cameras_of(sightings, cameras))

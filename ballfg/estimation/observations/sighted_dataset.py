@@ -13,7 +13,7 @@ from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.rig import in_order
+from ballfg.estimation.observations.rig import cameras_of, in_order, with_ends
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks import csv_files
@@ -58,7 +58,7 @@ class SightedDataset(TrackFolder):
         surfaces = replace(Surfaces.table_tennis(self.table), extent=info.table_extent)
         for name, sightings in balls.items():
             known, own = bounces.get(name), labels.of(name)
-            seen = in_order(sightings, cameras)  # rows of a rolling shutter are seen one after the other
+            seen = in_order(with_ends(sightings, cameras_of(sightings, cameras)), cameras)
             try:
                 track = sighted_track(name, seen, cameras, own, model=model, surfaces=surfaces, bounces=known)
                 self._tracks[name] = replace(track, dataset=self)

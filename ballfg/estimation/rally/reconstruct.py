@@ -10,6 +10,7 @@ from ballfg.arrays import Array, Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.noise.sightings import Noise, settled
+from ballfg.estimation.observations.rig import with_ends
 from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import Chosen, rally
@@ -148,7 +149,7 @@ def strokes_of(
         return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     kinked = _kinked(chosen, field)
-    noise = _noise(smoother, seen, replace(camera, covariance=None), chosen, kinked)
+    noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), chosen, kinked)
     seen = _with_noise(seen, noise, kinked)
     tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
     alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
@@ -231,7 +232,8 @@ def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, s
     rows = stroke.rows
     parts = np.zeros(len(rows), dtype=np.int64), seen.times[rows], seen.pixels[rows], seen.covariances[rows]
     bounces = written(stroke.bounces, float(seen.frames[0])) - camera.time_offset
-    sightings = Sightings((camera.name,), *parts)
+    way = np.nan_to_num(seen.streaks[rows, 1] - seen.streaks[rows, 0])
+    sightings = with_ends(Sightings((camera.name,), *parts, streaks=way), [camera])
     return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)
 
 

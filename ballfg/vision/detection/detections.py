@@ -218,7 +218,9 @@ def read_detections(
         frames, frame = np.unique(mine["t"], return_inverse=True)
         detections_file.check_inside(path, camera.name, camera.size, np.column_stack((mine["u"], mine["v"])))
         order = np.argsort(frame, kind="stable")
-        pixels, streaks = np.column_stack((mine["u"], mine["v"])), np.full((len(order), 2, 2), np.nan)
+        pixels, way = np.column_stack((mine["u"], mine["v"])), detections_file.streaks_of(mine)
+        way[(way == 0.0).all(axis=1)] = np.nan
+        streaks = (pixels[:, None] + 0.5 * way[:, None] * np.array([[-1.0], [1.0]]))[order]
         spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
         found.append(Detections(camera.name, frames, frame[order], pixels[order], spread, scores, streaks))
         check_step(f"{path}, camera {shown(camera.name)}", frames)

@@ -84,11 +84,13 @@ def write_tracking(
                 empty.write({KEY: np.zeros(0, dtype=object)} | {name: np.zeros(0) for name in (*VALUES, *SIGMAS)})
         write_cameras(stage / CAMERAS_FILE, tracking.cameras)
         with TableWriter(stage / DETECTIONS_FILE) as detections:
+            exposed = any(camera.exposure > 0.0 for camera in tracking.cameras)  # else a streak says nothing
             for camera, seen in enumerate(tracking.detections):
                 names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
                 for name, ball in zip(tracking.names, tracking.balls, strict=True):
                     names[tracking.rows(ball, camera)] = name
-                columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
+                own = (seen.times, seen.camera, seen.pixels, seen.covariances)
+                columns = seen_columns(*own, seen.streaks if exposed else None)
                 detections.write({KEY: names} | columns | {SCORE: seen.scores})
         sheet = ContactSheet(tracking, info.table_height, table)
         passing = [sheet.passing(camera, opened()) for camera, opened in enumerate(streams or ())]

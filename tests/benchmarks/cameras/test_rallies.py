@@ -8,7 +8,7 @@ import pytest
 
 from ballfg.benchmarks.cameras.rallies import Score, add_rally, camera_judged, film, judged
 from ballfg.benchmarks.results import Results
-from ballfg.estimation.rally.events import events_of
+from ballfg.estimation.rally.events import events_in_play
 from ballfg.estimation.rally.reconstruct import reconstruct
 from ballfg.estimation.rally.video import Rally
 from ballfg.vision.broadcast.pinhole import Pinhole
@@ -19,7 +19,7 @@ from tests.estimation.rally.planted import MODEL, POSE_SIGMAS, RATE, SURFACES, p
 def test_strokes_of_a_known_rally_are_found_and_those_of_another_are_false() -> None:
     of, motion, found = planted("side", 21)
     one = reconstruct(found, motion.shots[0], MODEL, SURFACES)
-    rally = Rally(motion, (one,), tuple(events_of(one, MODEL, SURFACES, 1.0 / RATE, 0.1525)), ())
+    rally = Rally(motion, (one,), tuple(events_in_play(one, MODEL, SURFACES, 1.0 / RATE, 0.1525)), ())
     score = judged(rally, of)
     assert (score.found, score.false) == (len(one.estimates), 0)
     assert max(score.errors) < 0.3
