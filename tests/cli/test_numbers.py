@@ -16,6 +16,7 @@ WORDS = {
     "predict": "{data} --observe 0.1 --out {out}.csv",
     "live": "--replay {data}",
     "diagnose": "{data} --out {out}",
+    "design": "{data} --stand x=0,y=-4,z=2 --cameras {data}/cameras.yaml",
     "simulate": "--out {out} --tracks 1",
     "render": "--out {out} --shots 1",
     "track": "{data}/tracks.csv --cameras {data}/cameras.yaml --out {out}",

@@ -33,7 +33,10 @@ def design(
     cameras: Annotated[
         Path | None, typer.Option(help="With --stand: file of the camera, whose lens counts, not its place.")
     ] = None,
-    noise: Annotated[float, typer.Option(help="With --stand: noise of the ball's place in the picture, px.")] = 0.5,
+    noise: Annotated[
+        float | None,
+        typer.Option(help="With --stand: noise of the ball's place in the picture, px.", show_default="0.5"),
+    ] = None,
     model: inputs.ModelFile = None,
     between: Annotated[
         str | None, typer.Option(help="Two effects to tell apart, as frame_tilt,table_tilt or wind.x,drag.k.")
@@ -64,8 +67,9 @@ def design(
         inputs.know_observations(observations_file)
         _stand(dataset, stand, cameras, noise, model, effects_file, out, jobs, **shots_only)
         return
-    if cameras is not None:
-        raise ValueError("--cameras is for --stand. Leave it out.")
+    for name, value in (("cameras", cameras), ("noise", noise)):
+        if value is not None:
+            raise ValueError(f"--{name} is for --stand. Leave it out.")
     from ballfg.diagnosis.design.levels import parse_levels
     from ballfg.diagnosis.design.plan import check_labels, design_shots
     from ballfg.dynamics import AnalyticModel
@@ -110,7 +114,7 @@ def _stand(
     dataset: Path,
     stand: str | None,
     cameras: Path | None,
-    noise: float,
+    noise: float | None,
     model: Path | None,
     effects_file: list[Path] | None,
     out: Path | None,
@@ -118,11 +122,13 @@ def _stand(
     **shots_only: object,
 ) -> None:
     """Prints how well a camera would know the strokes of a dataset from each place. Raises: ValueError: options."""
+    from ballfg.checks import check_number
     from ballfg.diagnosis.design.levels import combinations, parse_levels
-    from ballfg.diagnosis.design.stand import where_to_stand
+    from ballfg.diagnosis.design.stand import NOISE, where_to_stand
     from ballfg.tracks import TableWriter
     from ballfg.vision.camera_file import read_cameras
 
+    noise = NOISE if noise is None else check_number("--noise", noise, "px")
     if stand is None:
         raise ValueError("--candidates or --stand must be given; got neither. Say what to choose from.")
     for name, value in shots_only.items():

@@ -108,6 +108,7 @@ def test_the_command_prints_and_writes_places(
         (("--stand", "x=0,y=-4,z=2", "--candidates", "speed=8"), "--candidates is for shots, --stand for a camera."),
         ((), "--candidates or --stand must be given; got neither."),
         (("--candidates", "speed=8"), "--cameras is for --stand. Leave it out."),
+        (("--stand", "x=0,y=-4,z=2", "--noise", "0"), "noise must be positive; got 0 px."),
     ):
         assert status(*words, *bad) == 2
         assert message in capsys.readouterr().err
