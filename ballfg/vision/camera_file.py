@@ -21,7 +21,6 @@ LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
 CLOCK: Final = ("time_offset", "readout", "exposure")
 FIELDS: Final = (*LENS, *POSE, *CLOCK, "covariance")  # in the file's order; docs/calibrate.md explains them
-
 _MATRIX: Final = "camera_matrix"
 _NODES: Final = {
     "matrix": (_MATRIX,),

@@ -191,6 +191,21 @@ def test_a_rolling_shutter_shows_a_ball_when_its_row_is_read(ball: World) -> Non
     assert np.abs((blind.states - one.estimates[0].states) / one.estimates[0].sigmas).max() > 0.3
 
 
+def test_streaks_add_states_at_both_ends_of_exposures(ball: World) -> None:
+    times, states = rally(ball)
+    plain = seen(times, states, 3, hidden=0.0)
+    plain = plain.select(~np.isclose(plain.scores, 0.5))  # a light that glides without a streak hides the exposure
+    rows = np.flatnonzero(np.isclose(plain.scores, 0.9))
+    way = 0.01 * np.gradient(plain.pixels[rows], plain.times[rows], axis=0)
+    streaks = plain.streaks.copy()
+    streaks[rows] = plain.pixels[rows, None] + 0.5 * way[:, None] * np.array([[-1.0], [1.0]])
+    exposed = replace(SIDE, exposure=0.01)
+    strokes = track_one_camera(replace(plain, streaks=streaks), exposed, ball.model, ball.surfaces)
+    assert strokes.tracking.rate == RATE
+    for estimate, one in zip(strokes.estimates, strokes.tracking.balls, strict=True):
+        assert len(estimate) > 1.7 * len(one.sightings)
+
+
 def test_a_court_needs_no_ends(ball: World) -> None:
     times, states = rally(ball)
     for ends in (None, (-np.inf, np.inf, -np.inf, np.inf)):

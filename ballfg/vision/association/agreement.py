@@ -109,9 +109,8 @@ def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
         for k, camera in enumerate(cameras):
             mine = own.camera == own.cameras.index(camera.name)
             if mine.any():
-                line = path(
-                    camera.true_times(own.times[mine], own.pixels[mine]), own.pixels[mine], own.covariances[mine]
-                )
+                times = camera.true_times(own.times[mine], own.pixels[mine])
+                line = path(times, own.pixels[mine], own.covariances[mine])
                 pixels[start:end, k], covariances[start:end, k] = line.at(ball.times)
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     rows = np.flatnonzero(seen.sum(axis=1) >= 3)

@@ -56,10 +56,12 @@ class Tracking:
 
     @property
     def rate(self) -> float | None:
-        """Points per second of the balls, Hz, to six digits; None without a ball."""
+        """Points per second of the balls, of one camera its sightings, Hz, to six digits; None without a ball."""
         if not self.balls:
             return None
-        step = float(np.median(np.concatenate([np.diff(ball.times) for ball in self.balls])))
+        alone = len(self.cameras) == 1  # whose states may be those at both ends of each exposure
+        times = [ball.sightings.times if alone else ball.times for ball in self.balls]
+        step = float(np.median(np.concatenate([np.diff(one) for one in times])))
         return float(f"{1.0 / step:.6g}")
 
     def seen(self, ball: SeenBall, camera: int) -> Seen:
