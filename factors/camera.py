@@ -34,11 +34,14 @@ class CameraFactors(FactorBatch):
         loss: a robust one if the sightings contain wrong candidates.
         radii: (m, 2) px, radius in the picture, 0 where unknown, and its sigma; None: residuals have two numbers.
         ball: m, radius of the ball.
+        shifts: (m, 3) m, where the camera stood from its place in the bank; None: there.
 
     Raises: ValueError: if the shapes of the arrays do not agree.
     """
 
-    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "camera", "pixels", "root", "delay", "column", "radii")
+    row_arrays: ClassVar[tuple[str, ...]] = (
+        *("variables", "camera", "pixels", "root", "delay", "column", "radii", "shifts"),
+    )
 
     def __init__(
         self,
@@ -52,6 +55,7 @@ class CameraFactors(FactorBatch):
         loss: Loss | None = None,
         radii: Array | None = None,
         ball: float = 0.0,
+        shifts: Array | None = None,
     ) -> None:
         variables = np.asarray(states)[:, None]
         if columns is not None:
@@ -70,6 +74,7 @@ class CameraFactors(FactorBatch):
         self.column = np.full(m, FIXED) if columns is None else np.asarray(columns)[self.camera]
         self.bank = bank
         self.ball = ball
+        self.shifts = np.zeros((m, 3)) if shifts is None else shifts
         given = np.zeros((m, 2)) if radii is None else radii
         known = given[:, 0] > 0.0
         self.radii = np.stack((given[:, 0], np.divide(1.0, given[:, 1], out=np.zeros(m), where=known)), axis=1)
@@ -87,7 +92,7 @@ class CameraFactors(FactorBatch):
         state, root, column = inputs[0], self.root[rows], self.column[rows]
         tau = self.delay[rows] - _own(inputs[1:], column)
         velocity = state[:, VELOCITY]
-        points = state[:, POSITION] + tau[:, None] * velocity
+        points = state[:, POSITION] - self.shifts[rows] + tau[:, None] * velocity
         numbers, by_point, by_change = self._seen(points, rows, inputs[1:])
         residual = (root @ (numbers[:, :2] - self.pixels[rows])[..., None])[..., 0]
         slope, change = root @ by_point[:, :2], root @ by_change[:, :2]
@@ -127,7 +132,7 @@ class CameraFactors(FactorBatch):
             column = torch.from_numpy(self.column)
             own = inputs[1].gather(1, column.clamp(min=0)[:, None])[:, 0]
             tau = tau - torch.where(column != FIXED, own, 0.0)
-        points = inputs[0][:, POSITION] + tau[:, None] * inputs[0][:, VELOCITY]
+        points = inputs[0][:, POSITION] - torch.from_numpy(self.shifts) + tau[:, None] * inputs[0][:, VELOCITY]
         numbers = self._projected(points, inputs[1:])
         off = numbers[:, :2] - torch.from_numpy(self.pixels)
         residual = (torch.from_numpy(self.root) @ off[..., None])[..., 0]

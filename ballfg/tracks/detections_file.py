@@ -27,7 +27,8 @@ NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
 SCORE: Final = "score"
 RADIUS: Final = ("radius", "sigma_radius")
 STREAK: Final = ("streak_u", "streak_v")
-OPTIONAL: Final = (*NOISE, *RADIUS, *STREAK, SCORE)
+SHIFT: Final = ("shift_x", "shift_y", "shift_z")
+OPTIONAL: Final = (*NOISE, *RADIUS, *STREAK, *SHIFT, SCORE)
 UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}  # px; half a pixel, as of patch centres
 LEAST_SIGMA: Final = 1e-4  # px, best resolution of a camera; far surer pixels cannot be solved in double precision
 MOST_PIXELS: Final = 1e6  # px. Largest width of an image; larger numbers overflow when squared.
@@ -62,7 +63,8 @@ def read_sightings(
     Args:
         path: a table `trajectory,t,camera,u,v` (t in s, as recorded by the camera, u and v in px), optionally with
             `sigma_u`, `sigma_v` (px), `rho_uv`, `radius` of the ball in the picture (px; 0: unknown), `sigma_radius`
-            (px), `streak_u` and `streak_v` from one end of its streak to the other (px; 0: unknown), and `score`.
+            (px), `streak_u` and `streak_v` from one end of its streak to the other (px; 0: unknown), `shift_x`,
+            `shift_y`, `shift_z` to where the camera stood from its place (m; 0: there), and `score`.
         time_offsets: s, by camera of the rig: rows are sorted by t less the offset.
     Returns: sightings by trajectory, in the order in which the trajectories first appear; ignored entries, one sentence
         each.
@@ -96,7 +98,8 @@ def read_sightings(
         pixels = np.column_stack((own["u"], own["v"]))
         radii = _radii(own) if RADIUS[0] in own else None
         streaks = streaks_of(own) if any(one in own for one in STREAK) else None
-        found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, covariances(own), radii, streaks)
+        cues = (covariances(own), radii, streaks, shifts_of(own))
+        found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, *cues)
     return found, notes
 
 
@@ -223,17 +226,33 @@ def streaks_of(values: Mapping[str, Array]) -> Array:
     return np.stack([values.get(name, np.zeros(count)) for name in STREAK], axis=1)
 
 
+def shifts_of(values: Mapping[str, Array]) -> Array | None:
+    """(n, 3) m, where cameras stood from their places; None where a table does not say that they moved."""
+    (count,) = {len(column) for column in values.values()}
+    if not any(name in values for name in SHIFT):
+        return None
+    return np.stack([values.get(name, np.zeros(count)) for name in SHIFT], axis=1)
+
+
 def seen_columns(
-    times: Array, camera: ArrayLike, pixels: Array, spread: Array, ends: Array | None = None
+    times: Array,
+    camera: ArrayLike,
+    pixels: Array,
+    spread: Array,
+    ends: Array | None = None,
+    shift: Array | None = None,
 ) -> dict[str, ArrayLike]:
     """The columns of a table from stamps (n,) s, cameras, pixels (n, 2) and covariances (n, 2, 2) px^2.
 
-    Args: ends: (n, 2, 2) px, of streaks, NaN where there are none; None: without their columns.
+    Args:
+        ends: (n, 2, 2) px, of streaks, NaN where there are none; None: without their columns.
+        shift: (n, 3) m, where the cameras stood from their places; None: without its columns.
     """
+    moved = {} if shift is None else dict(zip(SHIFT, shift.T, strict=True))
     way = {} if ends is None else dict(zip(STREAK, np.nan_to_num(ends[:, 1] - ends[:, 0]).T, strict=True))
     sigma_u, sigma_v = (np.sqrt(spread[:, i, i]) for i in (0, 1))
     noise = {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": spread[:, 0, 1] / (sigma_u * sigma_v)}
-    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise, **way}
+    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise, **way, **moved}
 
 
 def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:

@@ -31,6 +31,8 @@ class Sightings:
     """(m, 2) px, radius of the ball in the picture, 0 where unknown, and its standard deviation; None: all unknown."""
     streaks: Array | None = None
     """(m, 2) px, from one end of the ball's streak to the other, either way, 0 where unknown; None: all unknown."""
+    shifts: Array | None = None
+    """(m, 3) m, where the camera stood from its own place, along the world's axes; None: no camera moved."""
 
     def __post_init__(self) -> None:
         check_iterable("cameras", self.cameras)
@@ -74,7 +76,7 @@ class Sightings:
             )
 
     def _check_cues(self, m: int) -> None:
-        """Checks radii and streaks of m sightings. Raises: ValueError."""
+        """Checks radii, streaks and shifts of m sightings. Raises: ValueError."""
         if self.radii is not None:
             radii = check_array("radii", self.radii, (m, 2), "Pass one row per sighting.")
             good = np.isfinite(radii).all(axis=1) & (radii[:, 0] >= 0.0) & (radii[:, 1] > 0.0)
@@ -83,20 +85,26 @@ class Sightings:
                 problem = f"radii must be a radius and a sigma above zero, in px; radii[{row}]={radii[row].tolist()}"
                 raise ValueError(f"{problem}. Give 0 for an unknown radius.")
             object.__setattr__(self, "radii", radii)
-        if self.streaks is not None:
-            streaks = check_array("streaks", self.streaks, (m, 2), "Pass one row per sighting.")
-            if not np.isfinite(streaks).all():
-                row = int(np.argwhere(~np.isfinite(streaks))[0][0])
-                raise ValueError(f"streaks must be finite; streaks[{row}]={streaks[row].tolist()}. Give 0 for unknown.")
-            object.__setattr__(self, "streaks", streaks)
+        for field, width, remedy in (("streaks", 2, "Give 0 for unknown"), ("shifts", 3, "Give 0 for none")):
+            if getattr(self, field) is None:
+                continue
+            cues = check_array(field, getattr(self, field), (m, width), "Pass one row per sighting.")
+            if not np.isfinite(cues).all():
+                row = int(np.argwhere(~np.isfinite(cues))[0][0])
+                raise ValueError(f"{field} must be finite; {field}[{row}]={cues[row].tolist()}. {remedy}.")
+            object.__setattr__(self, field, cues)
 
     def __len__(self) -> int:
         return len(self.times)
 
+    def from_cameras(self, points: Array) -> Array:
+        """(m, 3) m, of points (m, 3) m, where they would be if every camera were at its own place and saw the same."""
+        return points if self.shifts is None else points - self.shifts
+
     def select(self, rows: ArrayLike) -> "Sightings":
         """The rows of the numbers (k,), ascending, or of the mask (m,) bool. Raises: ValueError: if none remains."""
         kept = np.asarray(rows)
-        cues = (None if cue is None else cue[kept] for cue in (self.radii, self.streaks))
+        cues = (None if cue is None else cue[kept] for cue in (self.radii, self.streaks, self.shifts))
         own = (self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
         return Sightings(self.cameras, *own, *cues)
 

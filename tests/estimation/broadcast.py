@@ -101,8 +101,9 @@ def bounce_errors(rally: Rally, court: Court, labels: dict[str, Any], radius: fl
 def reprojected(rally: Rally) -> float:
     """Root mean square, of the image's diagonal, of the chosen candidates about the flights."""
     (one,) = rally.shots
+    shift = np.zeros((len(one.seen), 3)) if one.seen.shift is None else one.seen.shift
     left = [
-        one.camera.project(estimate.states[:, :3]) - one.seen.pixels[stroke.rows]
+        one.camera.project(estimate.states[:, :3] - shift[stroke.rows]) - one.seen.pixels[stroke.rows]
         for stroke, estimate in zip(one.chosen.strokes, one.estimates, strict=True)
     ]
     return float(np.sqrt((np.concatenate(left) ** 2).sum(axis=1).mean()) / np.hypot(*one.camera.size))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -112,6 +114,21 @@ def test_torch_gives_the_same_residual_and_derivatives(offsets: bool, known: boo
         slopes = torch.autograd.grad(again[:, axis].sum(), tensors, retain_graph=True)
         for slope, jacobian in zip(slopes, jacobians, strict=True):
             np.testing.assert_allclose(slope, jacobian[:, axis], atol=1e-8)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_camera_that_moved_sees_as_one_that_stands_there(known: bool) -> None:
+    """Each row's camera against a camera calibrated where it stood; with derivatives."""
+    kind, values = factors(**radii(6, known), shifts=np.random.default_rng(3).uniform(-0.5, 0.5, (6, 3)))
+    assert check_factor(kind, values, tolerance=1e-8) < 1e-8
+    found = kind.linearize(values)
+    there = [replace(RIG[k % 3], tvec=RIG[k % 3].tvec - RIG[k % 3].rotation @ kind.shifts[k]) for k in range(6)]
+    other, _ = factors(
+        **radii(6, known), camera=np.arange(6), bank=CameraBank([replace(c, name=str(k)) for k, c in enumerate(there)])
+    )
+    np.testing.assert_allclose(found.residual, other.linearize(values).residual, atol=1e-9)
+    inputs = (torch.from_numpy(values.states.copy()),)
+    np.testing.assert_allclose(kind.residual(inputs), found.residual, atol=1e-9)
 
 
 def test_some_rows_and_merged_kinds_are_the_same_rows() -> None:

@@ -111,7 +111,8 @@ def slopes(track: Track, estimate: Estimate, loss: Loss) -> Array:
     """
     seen = sightings_of(track)
     sightings, states = seen.sightings, estimate.states[seen.state]
-    pixels, slope = CameraBank(seen.cameras).jacobian(states[:, POSITION], sightings.camera)
+    points = sightings.from_cameras(states[:, POSITION])
+    pixels, slope = CameraBank(seen.cameras).jacobian(points, sightings.camera)
     off = sightings.pixels - pixels
     white = (np.linalg.inv(sightings.covariances) @ off[..., None])[..., 0]
     pull = loss.weight(np.sqrt((white * off).sum(axis=1)))[:, None] * white
@@ -119,7 +120,7 @@ def slopes(track: Track, estimate: Estimate, loss: Loss) -> Array:
     shift = np.stack([camera.tvec for camera in seen.cameras])[sightings.camera]
     focal = np.stack([np.diagonal(camera.matrix)[:2] for camera in seen.cameras])[sightings.camera]
     middle = np.stack([camera.matrix[:2, 2] for camera in seen.cameras])[sightings.camera]
-    local = (turn @ states[:, POSITION, None])[..., 0] + shift
+    local = (turn @ points[..., None])[..., 0] + shift
     place = local[:, :2] / local[:, 2:]
     moves = (slope @ states[:, VELOCITY, None])[..., 0]
     late = sightings.times - sightings.times[0]

@@ -113,13 +113,14 @@ def filmed_again(stroke: Stroke, laws: Laws, seed: Sequence[int]) -> Track | Non
     moments, place = np.unique(np.append(0.0, since), return_inverse=True)
     path = _flown(stroke, laws, moments, rng)[place[1:]]
     bank = CameraBank(tuple(laws.picture.camera(camera) for camera in seen.cameras))
-    pixels, _ = bank.jacobian(path[:, POSITION], sightings.camera)
+    points = sightings.from_cameras(path[:, POSITION])
+    pixels, _ = bank.jacobian(points, sightings.camera)
     if not np.isfinite(pixels).all():
         return None
     noise = np.linalg.cholesky(sightings.covariances) @ rng.standard_normal((len(pixels), 2, 1))
     radii = sightings.radii
     if radii is not None:
-        at = torch.from_numpy(path[:, POSITION].copy()), torch.from_numpy(sightings.camera)
+        at = torch.from_numpy(points.copy()), torch.from_numpy(sightings.camera)
         size = bank.radius(*at, laws.model.radius)[0].numpy() + radii[:, 1] * rng.standard_normal(len(radii))
         radii = np.stack((np.where(radii[:, 0] > 0.0, np.maximum(size, radii[:, 1]), 0.0), radii[:, 1]), axis=1)
     written = sightings.times[0] + slower * (sightings.times - sightings.times[0])

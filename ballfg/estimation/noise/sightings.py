@@ -122,7 +122,7 @@ def left_over(tracks: Sequence[Track], estimates: Sequence[Estimate]) -> tuple[A
     off, spread = list[Array](), list[Array]()
     for track, estimate in zip(tracks, estimates, strict=True):
         seen = sightings_of(track)
-        points = estimate.states[seen.state, POSITION]
+        points = seen.sightings.from_cameras(estimate.states[seen.state, POSITION])
         pixels, slope = CameraBank(seen.cameras).jacobian(points, seen.sightings.camera)
         off.append(seen.sightings.pixels - pixels)
         spread.append(slope @ estimate.covariances[seen.state, POSITION, POSITION] @ slope.swapaxes(1, 2))

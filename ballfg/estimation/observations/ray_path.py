@@ -69,6 +69,8 @@ class Rays:
         plane, root = np.empty((m, 2)), np.linalg.inv(np.linalg.cholesky(sightings.covariances))
         rotation = np.stack([camera.rotation for camera in cameras])[sightings.camera]
         tvec = np.stack([camera.tvec for camera in cameras])[sightings.camera]
+        if sightings.shifts is not None:
+            tvec = tvec - (rotation @ sightings.shifts[..., None])[..., 0]
         periods = []
         for number, camera in enumerate(cameras):
             (rows,) = np.nonzero(sightings.camera == number)

@@ -76,7 +76,8 @@ def with_ends(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
     pixels = sightings.pixels[rows] + 0.5 * end[:, None] * way[rows]
     spread = sightings.covariances[rows] * np.where(end == 0.0, 1.0, 2.0)[:, None, None]
     radii = None if sightings.radii is None else sightings.radii[rows]
-    return Sightings(sightings.cameras, sightings.camera[rows], times, pixels, spread, radii)
+    shifts = None if sightings.shifts is None else sightings.shifts[rows]
+    return Sightings(sightings.cameras, sightings.camera[rows], times, pixels, spread, radii, shifts=shifts)
 
 
 def _forward(streaks: Array, moved: Array) -> Array:

@@ -101,9 +101,9 @@ class CameraSightings(Observation):
         places = np.array([context.columns.get(f"{CHANGE}{name}.0", FIXED) for name in self.sightings.cameras])
         if (places == FIXED).all():
             given = (self.state, *measured, _bank(self.cameras), self.delay, unknown, loss)
-            return CameraFactors(*given, seen.radii, context.model.radius)
+            return CameraFactors(*given, seen.radii, context.model.radius, seen.shifts)
         given = (self.state, *measured, _bank(self.cameras), self.delay, columns, loss)
-        return UncertainCameraFactors(self.cameras, places, *given, seen.radii, context.model.radius)
+        return UncertainCameraFactors(self.cameras, places, *given, seen.radii, context.model.radius, seen.shifts)
 
     def unknowns(self, settings: Settings) -> Unknowns:
         """The time offsets that the settings name, s, each counted from that of its camera.
@@ -191,7 +191,8 @@ class CameraSightings(Observation):
         if not self.one_view or self.known is not None:
             return None
         seen, (camera,) = self.sightings, (self.cameras[number] for number in np.unique(self.sightings.camera))
-        spread = (LAWS / camera.depth(track.positions[self.state])[:, None] * np.diag(camera.matrix)[:2]) ** 2
+        points = seen.from_cameras(track.positions[self.state])
+        spread = (LAWS / camera.depth(points)[:, None] * np.diag(camera.matrix)[:2]) ** 2
         if np.median(spread) < np.median(np.trace(seen.covariances, axis1=1, axis2=2)) / 2.0:
             return None
         noisy = replace(seen, covariances=seen.covariances + spread[:, :, None] * np.eye(2))
@@ -208,7 +209,7 @@ class CameraSightings(Observation):
         """
         rows = (self.state >= first) & (self.state < first + len(positions))
         state, seen = self.state[rows] - first, self.sightings.select(rows)
-        pixels, slope = _bank(self.cameras).jacobian(positions[state], seen.camera)
+        pixels, slope = _bank(self.cameras).jacobian(seen.from_cameras(positions[state]), seen.camera)
         spread = slope @ covariances[state] @ slope.swapaxes(1, 2) + seen.covariances
         scale = np.sqrt(2.0) / np.linalg.norm(slope, axis=(1, 2))[:, None]  # m for a pixel
         return scale * (pixels - seen.pixels), scale * np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
@@ -227,7 +228,7 @@ class CameraSightings(Observation):
             return estimate
         first = np.searchsorted(self.state, np.arange(len(estimate)))
         centres = np.stack([camera.centre for camera in self.cameras])[self.sightings.camera[first]]
-        rays = estimate.states[:, POSITION] - centres
+        rays = self.sightings.select(first).from_cameras(estimate.states[:, POSITION]) - centres
         distance = np.linalg.norm(rays, axis=1)
         rays /= distance[:, None]
         sigma = np.sqrt(np.einsum("ni,nij,nj->n", rays, estimate.covariances[:, POSITION, POSITION], rays))

@@ -38,13 +38,14 @@ CANDIDATE: Final = np.dtype(
         ("bar", np.float64, (2,)),
         ("usual", np.float64),
         ("spot", np.float64),
+        ("tvec", np.float64, (3,)),
     ]
 )
-"""A candidate, as in `Field`; spot: logarithm of how much likelier it is the ball than clutter, by its number alone."""
+"""A candidate, as in `Field`; spot: logarithm of how much likelier it is the ball than clutter, by its number alone;
+tvec: m, of the camera that saw it, which may move."""
 VIEW: Final = np.dtype(
     [
         ("rotation", np.float64, (3, 3)),
-        ("tvec", np.float64, (3,)),
         ("focal", np.float64),
         ("middle", np.float64, (2,)),
         ("step", np.float64),
@@ -54,7 +55,8 @@ VIEW: Final = np.dtype(
     ]
 )
 """The camera, which has no distortion; numbers of `Field`; m, x of the court's middle, NaN where it has no ends."""
-CANDIDATES: Final[Any] = from_dtype(CANDIDATE)[::1]
+ROW: Final[Any] = from_dtype(CANDIDATE)
+CANDIDATES: Final[Any] = ROW[::1]
 VIEWED: Final[Any] = from_dtype(VIEW)
 
 
@@ -89,12 +91,12 @@ def _spread(covariance, share, spread):
                     spread[a, b] += share[c] * covariance[3 * c + a, 3 * d + b] * share[d]
 
 
-@machine_code(NOTHING(VIEWED, ONE, ONE, TWO))
-def _see(view, place, pixels, slope):
-    """Writes where the camera sees a place (3,) m, pixels (2,), and their slopes by it (2, 3)."""
+@machine_code(NOTHING(VIEWED, ROW, ONE, ONE, TWO))
+def _see(view, row, place, pixels, slope):
+    """Writes where the camera, as it saw a row, sees a place (3,) m, pixels (2,), and their slopes by it (2, 3)."""
     at = np.empty(3)
     for r in range(3):
-        at[r] = view.tvec[r]
+        at[r] = row.tvec[r]
         for a in range(3):
             at[r] += view.rotation[r, a] * place[a]
     depth = max(at[2], NEAREST)
@@ -118,7 +120,7 @@ def _gain(rays, candidates, scene, view, rows, times, bounces, path):
             moment = rays[row].time + (half if end else -half)
             drop = share_at(moment, times, bounces, path.drag, scene.gravity, share)
             _place(path.vectors, share, drop, at)
-            _see(view, at, ends[end], slope)
+            _see(view, candidates[row], at, ends[end], slope)
         one, long = candidates[row], view.exposure / SHORT
         x, y = long * (ends[1, 0] - ends[0, 0]), long * (ends[1, 1] - ends[0, 1])
         gain += one.spot + bar_gain(one.bar[0], one.bar[1], x, y, one.usual)
@@ -167,14 +169,14 @@ def all_rated(rays, candidates, scene, view, rows, numbers, vectors, drag, covar
         vectors[k], drag[k], covariance[k] = one.path.vectors, one.path.drag, one.path.covariance
 
 
-@machine_code(NOTHING(SCENE, VIEWED, RATED, REAL, ONE, TWO))
-def _foretell(scene, view, stroke, moment, pixels, spread):
-    """Where a stroke is seen at a moment, s. Writes: pixels (2,) and their covariance (2, 2)."""
+@machine_code(NOTHING(SCENE, VIEWED, ROW, RATED, REAL, ONE, TWO))
+def _foretell(scene, view, row, stroke, moment, pixels, spread):
+    """Where a stroke is seen at a moment, s, as a row was. Writes: pixels (2,), their covariance (2, 2)."""
     path, count = stroke.path, len(stroke.path.drag) - 1
     share, at, slope, wide = np.empty(len(path.vectors)), np.empty(3), np.empty((2, 3)), np.empty((3, 3))
     drop = share_at(moment, stroke.times, count, path.drag, scene.gravity, share)
     _place(path.vectors, share, drop, at)
-    _see(view, at, pixels, slope)
+    _see(view, row, at, pixels, slope)
     _spread(path.covariance, share, wide)
     spread[:] = 0.0
     for r in range(2):
@@ -195,7 +197,7 @@ def _met(rays, candidates, scene, view, here, rows, stroke):
     for row in range(first, end):
         if rays[row].time != moment:  # a rolling shutter sees each row at a time of its own
             moment = rays[row].time
-            _foretell(scene, view, stroke, moment, pixels, spread)
+            _foretell(scene, view, candidates[row], stroke, moment, pixels, spread)
         one = candidates[row]
         x, y = one.pixels[0] - pixels[0], one.pixels[1] - pixels[1]
         xx, yy = one.covariance[0, 0] + spread[0, 0], one.covariance[1, 1] + spread[1, 1]

@@ -67,17 +67,15 @@ class ShotRally:
 
 def fixed_camera(shot: Shot, name: str) -> tuple[Pinhole, Camera]:
     """A camera without distortion that looks where the shot looks on the whole, and the same with its covariance."""
-    axes = np.array([camera.turn[2] for camera in shot.cameras])
-    middle = int(np.argmin(np.linalg.norm(axes - np.median(axes, axis=0), axis=1)))
-    one = replace(shot.cameras[middle], bend=0.0)
+    one = replace(shot.cameras[shot.middle], bend=0.0)
     to_world = np.eye(7)
     to_world[:3, :3] = one.turn.T
-    covariance = to_world @ shot.covariances[middle] @ to_world.T
+    covariance = to_world @ shot.covariances[shot.middle] @ to_world.T
     return one, one.camera(name, 0.5 * (covariance + covariance.T))
 
 
 def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> Detections:
-    """The candidates of a moving camera where a fixed one at the same place sees them."""
+    """The candidates of a moving camera where one that looks another way sees them from the same place."""
     pixels, streaks, spread = found.pixels.copy(), found.streaks.copy(), found.covariances.copy()
     for number, camera in enumerate(shot.cameras):
         rows = slice(*np.searchsorted(found.frame, (number, number + 1)))
@@ -85,7 +83,8 @@ def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> 
         spread[rows] *= (onto.focal / camera.focal) ** 2
     seen: Mask = np.asarray(np.isfinite(pixels).all(axis=1))  # a wide pan leaves something behind
     spread += FRAME_SIGMA**2 * np.eye(2)
-    return replace(found, camera=name, pixels=np.nan_to_num(pixels), covariances=spread, streaks=streaks).select(seen)
+    moved = replace(found, camera=name, pixels=np.nan_to_num(pixels), covariances=spread, streaks=streaks)
+    return replace(moved, shifts=shot.shifts).select(seen)
 
 
 def without_lens(seen: Detections, camera: Camera) -> tuple[Detections, Camera]:
@@ -186,7 +185,7 @@ def search(
     chosen = NOTHING
     for _ in range(ROUNDS):
         field = plain.smooth(density)
-        grower = Grower.of(field, times, pinhole, physics_of(model), surfaces)
+        grower = Grower.of(field, times, pinhole, physics_of(model), surfaces, seen.shift)
         chosen = rally(grower, seeds, chosen.strokes, watch)
         if not chosen.strokes:
             break
@@ -233,7 +232,8 @@ def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, s
     parts = np.zeros(len(rows), dtype=np.int64), seen.times[rows], seen.pixels[rows], seen.covariances[rows]
     bounces = written(stroke.bounces, float(seen.frames[0])) - camera.time_offset
     way = np.nan_to_num(seen.streaks[rows, 1] - seen.streaks[rows, 0])
-    sightings = with_ends(Sightings((camera.name,), *parts, streaks=way), [camera])
+    shifts = None if seen.shift is None else seen.shift[rows]
+    sightings = with_ends(Sightings((camera.name,), *parts, streaks=way, shifts=shifts), [camera])
     return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)
 
 

@@ -60,41 +60,52 @@ class Stroke:
 
 @dataclass(frozen=True, eq=False)
 class Grower:
-    """What strokes are grown in: all candidates, the scene with their rays, and the camera."""
+    """What strokes are grown in: candidates, the scene with their rays, the camera, and its tvec (n, 3) m for each."""
 
     field: Field
     scene: Scene
     camera: Camera
+    tvec: Array
 
     @classmethod
     def of(
-        cls, field: Field, times: Array, camera: Camera, physics: SegmentationPhysics, surfaces: Surfaces
+        cls,
+        field: Field,
+        times: Array,
+        camera: Camera,
+        physics: SegmentationPhysics,
+        surfaces: Surfaces,
+        shift: Array | None = None,
     ) -> "Grower":
-        """A grower of the candidates of a field at times (n,) s, seen by a fixed camera without distortion."""
+        """A grower of the candidates of a field at times (n,) s, seen by a camera without distortion.
+
+        Args: shift: (n, 3) m, where it stood from its place; None: there.
+        """
         count, rotation = len(times), camera.rotation
+        tvec = camera.tvec - (np.zeros((count, 3)) if shift is None else shift) @ rotation.T
         plane = camera.normalized(field.pixels)
         rays = Rays(
             times,
             np.zeros(count, dtype=np.int64),
             rotation[:2] - plane[..., None] * rotation[2],
-            plane * camera.tvec[2] - camera.tvec[:2],
+            plane * tvec[:, 2:] - tvec[:, :2],
             np.linalg.inv(np.linalg.cholesky(field.covariances)) @ camera.matrix[:2, :2],
-            np.tile(np.append(rotation[2], camera.tvec[2]), (count, 1)),
+            np.column_stack((np.tile(rotation[2], (count, 1)), tvec[:, 2])),
             field.step,
         )
-        return cls(field, Scene(rays, physics, surfaces, surfaces.table_height, LIFT), camera)
+        return cls(field, Scene(rays, physics, surfaces, surfaces.table_height, LIFT), camera, tvec)
 
     @cached_property
     def _seen(self) -> tuple[Any, ...]:
         """Rays, candidates, scene and view for machine code."""
         field, camera = self.field, self.camera
         found = np.zeros(len(field.frame), dtype=CANDIDATE)
-        own = (field.frame, field.pixels, field.covariances, field.bars, field.usual, field.spot)
+        own = (field.frame, field.pixels, field.covariances, field.bars, field.usual, field.spot, self.tvec)
         for name, values in zip(CANDIDATE.names or (), own, strict=True):
             found[name] = values
         ends = ends_of(self.scene.surfaces)
         net = np.nan if ends is None else float(ends[0].mean())
-        lens = (camera.rotation, camera.tvec, camera.matrix[0, 0], camera.matrix[:2, 2])
+        lens = (camera.rotation, camera.matrix[0, 0], camera.matrix[:2, 2])
         view = np.array([(*lens, field.step, field.seen, field.exposure, net)], dtype=VIEW)[0]
         return self.scene.sightings, found, self.scene.numbers, view
 

@@ -56,12 +56,15 @@ def write_rally(
         with TableWriter(stage / EVENTS) as table:
             table.write(event_columns((*events, *cuts)))
         with TableWriter(stage / DETECTIONS_FILE) as table:
+            moves = any(one.seen.shifts is not None for one in rallies)
             for one in rallies:
                 names = np.full(len(one.seen), "", dtype=object)
                 for stroke, estimate in zip(one.chosen.strokes, one.estimates, strict=True):
                     names[stroke.rows] = estimate.name
-                seen = seen_columns(one.seen.times, one.seen.camera, one.seen.pixels, one.seen.covariances)
-                table.write({KEY: names} | seen | {SCORE: one.seen.scores})
+                own = one.seen
+                shift = np.zeros((len(own), 3)) if moves and own.shift is None else own.shift
+                seen = seen_columns(own.times, own.camera, own.pixels, own.covariances, shift=shift)
+                table.write({KEY: names} | seen | {SCORE: own.scores})
         if strokes:
             with TableWriter(stage / STATES) as states:
                 for estimate in (estimate for one in rallies for estimate in one.estimates):

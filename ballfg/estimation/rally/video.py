@@ -47,6 +47,10 @@ class Rally:
         notes = [] if seen == len(self.motion.times) else [f"{len(self.motion.times) - seen} pictures show no court"]
         if self.doubled:
             notes.append(f"{self.doubled} pictures repeat the one before, as after a change of frame rate: left out")
+        for shot in self.motion.shots:
+            if shot.shifts is not None:
+                far = np.ptp(shot.shifts, axis=0).max()
+                notes.append(f"the camera of frame {shot.first} on moves, by {far:.2f} m: each picture has its place")
         for one in self.shots:
             unsure = (estimate for estimate in one.estimates if estimate.status is not Status.OK)
             notes += [f"stroke {estimate.name}: {estimate.status.value}" for estimate in unsure]
@@ -70,7 +74,7 @@ def track_moving_camera(
     candidates: OwnCandidates | None = None,
     watch: Watch = unwatched,
 ) -> Rally:
-    """The strokes in a video of one camera that stands at one place.
+    """The strokes in a video of one camera that turns and zooms, and may move.
 
     Args:
         frames: opens the video, each time anew.  count: of its pictures, about.  court: in them.  model: the ball.

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.checks import check_count, check_range
+from ballfg.checks import check_count, check_range, shown
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.vision.association import gathering
@@ -81,6 +81,13 @@ def _footage(
             "Leave out cameras without detections, or rename."
         )
     ordered = [by_name[name] for name in names]
+    for seen in ordered:
+        if seen.shifts is not None:
+            raise ValueError(
+                f"camera {shown(seen.camera)} must stand where the calibration has it; its detections have shifts. Of "
+                "several cameras none may move: leave the others out with --without, or the columns shift_x, shift_y, "
+                "shift_z."
+            )
     stamps = [seen.frames for seen in ordered]
     origin = min((float(frames[0]) for frames in stamps if len(frames)), default=0.0)
     counted = [replace(seen, frames=elapsed(seen.frames, origin)) for seen in ordered]

@@ -67,7 +67,7 @@ def find_candidates(
     """
     size, count = _diameters(shot, court, radius), len(shot)
 
-    def windows() -> Iterator[tuple[list[Image], int, tuple[Pinhole, ...], Array]]:
+    def windows() -> Iterator[tuple[list[Image], int, tuple[Pinhole, ...], Array, float]]:
         every = enumerate(watch(frames(), len(stamps), "pictures searched for the ball"))
         mine = (image for k, (_, image) in every if shot.first <= k < shot.first + count)
         window = deque[Image](maxlen=2 * FAR + 1)
@@ -76,7 +76,8 @@ def find_candidates(
                 window.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA), dtype=np.uint8))
             if number >= 0:
                 begin = min(number + FAR + 1, count) - len(window)
-                yield list(window), number - begin, shot.cameras[begin : begin + len(window)], size[number]
+                cameras = shot.cameras[begin : begin + len(window)]
+                yield list(window), number - begin, cameras, size[number], shot.near
 
     found = in_threads(lambda one: aligned_candidates(*one, colour), windows())
     times = stamps[shot.first : shot.first + count].tolist()
@@ -95,16 +96,24 @@ def _diameters(shot: Shot, court: Court, radius: float) -> Array:
 
 
 def aligned_candidates(
-    window: list[Image], index: int, cameras: tuple[Pinhole, ...], size: Array, colour: Colour = "white"
+    window: list[Image],
+    index: int,
+    cameras: tuple[Pinhole, ...],
+    size: Array,
+    near: float = 0.0,
+    colour: Colour = "white",
 ) -> Candidates:
-    """The candidates of the picture `index` of a window, with the cameras of all of it and diameters (2,) px."""
+    """The candidates of the picture `index` of a window, with the cameras of all of it and diameters (2,) px.
+
+    Args: near: 1/m, as of `Shot`.
+    """
     here = window[index]
     rise: Image | None = None
     for apart in (NEAR, FAR):
         beside = [index + step for step in (-apart, apart) if 0 <= index + step < len(window)]
         if not beside:
             continue
-        others = [_warped(window[i], cameras[i], cameras[index]) for i in beside]
+        others = [_warped(window[i], cameras[i], cameras[index], near) for i in beside]
         most = others[0] if len(others) == 1 else cv2.max(*others)
         change = _brighter(here, np.asarray(most, dtype=np.uint8), colour)
         rise = change if rise is None else np.maximum(rise, change)
@@ -122,11 +131,11 @@ def _brighter(here: Image, most: Image, colour: Colour) -> Image:
     return np.minimum(red, cv2.subtract(grey, others)).astype(np.uint8)
 
 
-def _warped(image: Image, camera: Pinhole, onto: Pinhole) -> Image:
-    """A picture as another camera at the same place sees it; what it does not see is white."""
+def _warped(image: Image, camera: Pinhole, onto: Pinhole, near: float) -> Image:
+    """A picture's background as another camera sees it; what it does not see is white."""
     width, height = camera.size
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 5), np.linspace(0, height - 1, 5)), axis=-1).reshape(-1, 2)
-    there = camera.onto(grid, onto)
+    there = camera.onto(grid, onto, near)
     if np.abs(there - grid).max() < 0.05:
         return image
     homography = cv2.findHomography(grid, there, 0)[0]

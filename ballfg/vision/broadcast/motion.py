@@ -48,16 +48,30 @@ REACH: Final = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Pictures first, first + 1, ... between two cuts, and their cameras at one place.
+    """Pictures first, first + 1, ... between two cuts, and their cameras.
 
     Attributes: cameras: one a picture.  covariances: (n, 7, 7) of turn (rad, in the camera's frame), place (m), log
         focal length.  fit: (n,) share of the court's lines that fit.
+        near: 1/m, one over the background's distance, of a camera that moves; 0: it stands at one place.
     """
 
     first: int
     cameras: tuple[Pinhole, ...]
     covariances: Array
     fit: Array
+    near: float = 0.0
+
+    @property
+    def shifts(self) -> Array | None:
+        """(n, 3) m, to the place of each picture from that of `middle`; None of a camera that stands."""
+        places = np.stack([camera.place for camera in self.cameras])
+        return places - places[self.middle] if self.near else None
+
+    @property
+    def middle(self) -> int:
+        """Number of the picture that looks where the shot looks on the whole."""
+        axes = np.array([camera.turn[2] for camera in self.cameras])
+        return int(np.argmin(np.linalg.norm(axes - np.median(axes, axis=0), axis=1)))
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -195,13 +209,17 @@ def _followed(
             camera = carried(camera, links[k - first - 1].before, links[k - first - 1].now)
         picture = brightness(image)
         better, fit = corrected(picture, camera, court, TURNED)
+        if fit < FITS:
+            elsewhere, better_fit = corrected(picture, camera, court)
+            if better_fit > FITS and elsewhere.place[2] > 0.0:  # it moves
+                better, fit = elsewhere, better_fit
         camera = better if fit > FOLLOWED else camera
         lines = ridges(picture, camera, court, REACH)
         cameras.append(camera)
         seen.append(lines if fit > FOLLOWED else None)
         fits.append(lines.fit)
     found: Solved = solve(cameras, seen, links)
-    return Shot(first, found.cameras, found.covariances, np.array(fits))
+    return Shot(first, found.cameras, found.covariances, np.array(fits), found.near)
 
 
 def carried(camera: Pinhole, before: Array, now: Array) -> Pinhole:

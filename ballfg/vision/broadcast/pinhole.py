@@ -51,9 +51,12 @@ class Pinhole:
         plane = undone(seen, self.bend)
         return np.concatenate((plane, np.ones((*plane.shape[:-1], 1))), axis=-1)
 
-    def onto(self, pixels: Array, other: Pinhole) -> Array:
-        """(..., 2) px where another camera at the same place sees what this one sees at pixels (..., 2)."""
-        return other.project(other.place + self.directions(pixels) @ self.turn)
+    def onto(self, pixels: Array, other: Pinhole, near: float = 0.0) -> Array:
+        """(..., 2) px where another camera sees what this one sees at pixels (..., 2).
+
+        Args: near: 1/m, one over its distance along the axis; 0: it is far away, or both are at one place.
+        """
+        return other.project(other.place + near * (self.place - other.place) + self.directions(pixels) @ self.turn)
 
     def camera(self, name: str, covariance: Array | None = None) -> Camera:
         """The same as a camera of the other rooms; covariance: (7, 7) of turn, place and log focal length."""

@@ -87,6 +87,8 @@ class Detections:
     """(n,) dimensionless, in [0, 1], similarity to a ball."""
     streaks: Array
     """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
+    shifts: Array | None = None
+    """(f, 3) m, where the camera stood in each frame, from its own place; None: it did not move."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, str):
@@ -102,6 +104,9 @@ class Detections:
         if not np.isfinite(stamps).all():
             raise ValueError(f"{what}: frames must be finite; got {stamps[~np.isfinite(stamps)][0]}.")
         _check_fields(self, what)
+        if self.shifts is not None:
+            object.__setattr__(self, "shifts", _numbers(what, "shifts", self.shifts, (len(stamps), 3)))
+            _refuse(np.asarray(~np.isfinite(self.shifts).all(axis=1)), what, "shifts", "be finite")
         frame = np.array(self.frame, dtype=np.int64)
         if frame.shape != (len(self.pixels),):
             raise ValueError(f"{what}: frame must have shape ({len(self.pixels)},); got {frame.shape}.")
@@ -118,6 +123,11 @@ class Detections:
     def times(self) -> Array:
         """(n,) s, the recorded stamp of each candidate."""
         return np.asarray(self.frames[self.frame])
+
+    @property
+    def shift(self) -> Array | None:
+        """(n, 3) m, where the camera stood as it saw each candidate, from its own place; None: it did not move."""
+        return None if self.shifts is None else self.shifts[self.frame]
 
     def in_frame(self, number: int) -> Candidates:
         """The candidates of one frame."""
@@ -188,8 +198,8 @@ def read_detections(
     rows is free.
 
     Args:
-        path: `t` (s, as the camera writes it), `camera`, `u`, `v` (px), optionally `sigma_u`, `sigma_v` (px), `rho_uv`
-            and `score`.
+        path: `t` (s, as the camera writes it), `camera`, `u`, `v` (px), optionally `sigma_u`, `sigma_v` (px), `rho_uv`,
+            `score`, and the columns `SHIFT` (m).
         ignored: names of cameras whose rows are passed over.
     Returns: detections in the order of the cameras, and what was ignored, one sentence each.
     Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range, an
@@ -215,13 +225,15 @@ def read_detections(
     found = []
     for camera in cameras:
         mine = {column: numbers[names == camera.name] for column, numbers in values.items()}
-        frames, frame = np.unique(mine["t"], return_inverse=True)
+        frames, first, frame = np.unique(mine["t"], return_index=True, return_inverse=True)
         detections_file.check_inside(path, camera.name, camera.size, np.column_stack((mine["u"], mine["v"])))
         order = np.argsort(frame, kind="stable")
         pixels, way = np.column_stack((mine["u"], mine["v"])), detections_file.streaks_of(mine)
         way[(way == 0.0).all(axis=1)] = np.nan
         streaks = (pixels[:, None] + 0.5 * way[:, None] * np.array([[-1.0], [1.0]]))[order]
         spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
-        found.append(Detections(camera.name, frames, frame[order], pixels[order], spread, scores, streaks))
+        shifts = detections_file.shifts_of(mine)
+        shifts = None if shifts is None else shifts[first]
+        found.append(Detections(camera.name, frames, frame[order], pixels[order], spread, scores, streaks, shifts))
         check_step(f"{path}, camera {shown(camera.name)}", frames)
     return found, notes

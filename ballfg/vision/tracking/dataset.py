@@ -90,7 +90,7 @@ def write_tracking(
                 for name, ball in zip(tracking.names, tracking.balls, strict=True):
                     names[tracking.rows(ball, camera)] = name
                 own = (seen.times, seen.camera, seen.pixels, seen.covariances)
-                columns = seen_columns(*own, seen.streaks if exposed else None)
+                columns = seen_columns(*own, seen.streaks if exposed else None, seen.shift)
                 detections.write({KEY: names} | columns | {SCORE: seen.scores})
         sheet = ContactSheet(tracking, info.table_height, table)
         passing = [sheet.passing(camera, opened()) for camera, opened in enumerate(streams or ())]

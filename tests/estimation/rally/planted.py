@@ -1,6 +1,8 @@
-"""Planted rallies: true strokes as a still camera sees them, with bars of motion blur, among false candidates."""
+"""Planted rallies: true strokes as a camera that stands or moves sees them, with bars of motion blur, among clutter."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,28 +26,31 @@ POSE_SIGMAS = (2e-4, 2e-4, 2e-4, 0.01, 0.01, 0.01, 1e-3)  # rad, m, and of the l
 
 
 def planted(
-    view: str, seed: int, *, false: int = 8, missing: float = 0.0, length: float = 2.6
+    view: str, seed: int, *, false: int = 8, missing: float = 0.0, length: float = 2.6, travel: float = 0.0
 ) -> tuple[Truth, Motion, Detections]:
-    """The truth, its camera (still: the first one of the view), and the candidates of its first `length` s.
+    """The truth, its camera (as the first one of the view looks), and the candidates of its first `length` s.
 
     Args: false: candidates a picture, anywhere.  missing: share of pictures without the ball.
+        travel: m, of the camera along the table meanwhile; 0: it stands.
     """
     of, rng = truth(view, RATE, seed), np.random.default_rng([seed, 3])
     count, camera = int(length * RATE), of.cameras[0]
+    places = camera.place + np.outer(np.linspace(-0.5, 0.5, count), [travel, 0.0, 0.0])
+    cameras = [replace(camera, place=place) for place in places]
     half, frames = 0.5 * EXPOSURE / RATE, list[tuple[float, Candidates]]()
     for number in range(count):
         t = number / RATE
         pixels, streaks = rng.uniform((0.0, 0.0), camera.size, (false, 2)), np.full((false, 2, 2), np.nan)
         states, scores = [of.at(t + shift) for shift in (-half, 0.0, half)], rng.uniform(0.0, 0.5, false)
         if all(state is not None for state in states) and rng.random() >= missing:
-            seen = camera.project(np.array([state[POSITION] for state in states if state is not None]))
+            seen = cameras[number].project(np.array([state[POSITION] for state in states if state is not None]))
             seen += rng.normal(0.0, NOISE, seen.shape)
             pixels, streaks = np.append(pixels, seen[1:2], axis=0), np.append(streaks, seen[None, ::2], axis=0)
             scores = np.append(scores, 0.6)
         covariances = np.tile(0.36 * np.eye(2), (len(pixels), 1, 1))
         frames.append((t, Candidates(pixels, covariances, scores, streaks)))
     covariance = np.tile(np.diag(np.square(POSE_SIGMAS)), (count, 1, 1))
-    shot = Shot(0, (camera,) * count, covariance, np.ones(count))
+    shot = Shot(0, tuple(cameras), covariance, np.ones(count), 0.1 if travel else 0.0)
     times = np.arange(count) / RATE
     return of, Motion((shot,), times, ()), Detections.of_frames("main", frames)
 

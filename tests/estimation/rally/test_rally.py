@@ -37,17 +37,18 @@ from tests.vision.broadcast.tennis import TENNIS
 NET = 0.1525
 
 
-def found_in(view: str, seed: int, missing: float = 0.0) -> tuple[Truth, Rally]:
-    of, motion, found = planted(view, seed, missing=missing)
+def found_in(view: str, seed: int, missing: float = 0.0, travel: float = 0.0) -> tuple[Truth, Rally]:
+    of, motion, found = planted(view, seed, missing=missing, travel=travel)
     one = reconstruct(found, motion.shots[0], MODEL, SURFACES)
     events = events_in_play(one, MODEL, SURFACES, 0.04, NET)
     rows = [stroke_row(estimate, events, MODEL, NET) for estimate in one.estimates]
     return of, Rally(motion, (one,), tuple(events), tuple(rows))
 
 
-@pytest.fixture(scope="module")
-def made() -> tuple[Truth, Rally]:
-    return found_in("side", 21)
+@pytest.fixture(scope="module", params=[0.0, 0.8], ids=["stands", "moves"])
+def made(request: pytest.FixtureRequest) -> tuple[Truth, Rally]:
+    """Of a camera that stands, and of one that moves by 0.8 m along the table."""
+    return found_in("side", 21, travel=request.param)
 
 
 @pytest.fixture(scope="module")

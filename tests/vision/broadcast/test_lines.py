@@ -11,6 +11,18 @@ from ballfg.benchmarks.cameras.hall import COURT, looking, picture
 from ballfg.vision.broadcast import graph
 from ballfg.vision.broadcast.background import Match
 from ballfg.vision.broadcast.lines import CROSSING, FLANK, _brightest, brightness, ridges
+from ballfg.vision.broadcast.measured import (
+    LENS,
+    LINES,
+    NEAR,
+    ROBUST,
+    Background,
+    CourtLines,
+    Noise,
+    place_key,
+    turn_key,
+    zoom_key,
+)
 
 PLACES = np.array([[100.0, 80.0], [800.0, 120.0], [500.0, 300.0], [150.0, 450.0]])
 STILL = Match(PLACES, PLACES, np.eye(3))
@@ -57,31 +69,21 @@ def test_the_noise_is_that_with_which_the_residuals_are_most_probable(seen):
     """Against a search over the density of which Cauchy's loss is the logarithm."""
     rng, sigmas = np.random.default_rng(4), np.array([0.05, 0.1, 0.2, 0.08, 0.3, 0.15])
     drawn = [replace(one, offset=rng.standard_t(3, len(one.line)) * sigmas[one.line]) for one in seen]
-    values = gtsam.Values()
-    values.insert(graph.LENS, np.zeros(1))
-    values.insert(graph.PLACE, gtsam.Point3(CAMERA.place))
-    values.insert(graph.LINES, np.zeros(6))
-    for k in range(len(drawn)):
-        values.insert(graph._turn(k), gtsam.Rot3(CAMERA.turn.T))
-        values.insert(graph._zoom(k), np.array([np.log(CAMERA.focal)]))
-    start = graph.Noise(np.full(6, 0.1), 0.03, 0.15)
-    first = gtsam.Values(values)
     cameras, still = [CAMERA] * len(drawn), [STILL] * (len(drawn) - 1)
+    problem = graph.Problem(cameras, drawn, still)
+    values = problem.first(cameras, moves=False)
 
-    def batches(noise):
-        return graph.CourtLines(cameras, drawn, noise), graph.Background(cameras, still, noise)
+    def left_by(noise):
+        batches = CourtLines(cameras, drawn, noise), Background(cameras, still, noise)
+        return graph.Fit(problem, noise, *batches, graph._graph(*batches, values, noise), values)
 
-    marginals = gtsam.Marginals(graph._graph(*batches(start), first, start), values)
-    noise, at = start, graph.Unknowns.of(values, len(drawn))
+    noise = Noise(np.full(6, 0.1), 0.03, 0.15)
     for _ in range(60):
-        noise = graph._noise(*batches(noise), at, marginals, noise)
+        noise = graph._noise(left_by(noise))
     tried = np.geomspace(0.02, 1.0, 2000)
     for line in range(6):
         left = np.concatenate([one.offset[one.line == line] for one in drawn])
-        cost = [
-            0.5 * graph.ROBUST**2 * np.log1p((left / s / graph.ROBUST) ** 2).sum() + len(left) * np.log(s)
-            for s in tried
-        ]
+        cost = [0.5 * ROBUST**2 * np.log1p((left / s / ROBUST) ** 2).sum() + len(left) * np.log(s) for s in tried]
         assert noise.ridges[line] == pytest.approx(tried[int(np.argmin(cost))], rel=0.005)
     assert noise.lines < graph.LINE_SIGMA * 1.5
 
@@ -98,20 +100,26 @@ def test_no_ridge_is_sought_where_another_line_is_in_the_way(seen):
     assert 0 < len(middle) < 8 * 24
 
 
-def test_derivatives_of_the_factors_are_those_of_differences(seen):
-    """Of the ridges and of the background of two pictures, by each of their variables, and at new values anew."""
+@pytest.mark.parametrize("walk", [0.0, 0.01])
+def test_derivatives_of_the_factors_are_those_of_differences(seen, walk):
+    """Of ridges and background of two pictures, of a standing and a moving camera, and at new values anew."""
     likes = [looking((0.5, -7.02, 3.0), (0.02 * k, 0.0, 0.0), 1003.0 + 9.0 * k) for k in range(2)]
-    noise = graph.Noise(np.linspace(0.05, 0.2, len(COURT.lines)), 0.03, 0.15)
-    values, widths = gtsam.Values(), {graph.PLACE: 3, graph.LENS: 1, graph.LINES: len(COURT.lines)}
-    values.insert(graph.PLACE, gtsam.Point3(likes[0].place))
-    values.insert(graph.LENS, np.array([-0.02]))
-    values.insert(graph.LINES, np.linspace(-0.3, 0.3, len(COURT.lines)))
+    noise = Noise(np.linspace(0.05, 0.2, len(COURT.lines)), 0.03, 0.15, walk)
+    values, widths = gtsam.Values(), {LENS: 1, LINES: len(COURT.lines)}
+    values.insert(LENS, np.array([-0.02]))
+    values.insert(LINES, np.linspace(-0.3, 0.3, len(COURT.lines)))
     for k, like in enumerate(likes):
-        values.insert(graph._turn(k), gtsam.Rot3(like.turn.T))
-        values.insert(graph._zoom(k), np.array([np.log(like.focal)]))
-        widths |= {graph._turn(k): 3, graph._zoom(k): 1}
+        values.insert(turn_key(k), gtsam.Rot3(like.turn.T))
+        values.insert(zoom_key(k), np.array([np.log(like.focal)]))
+        widths |= {turn_key(k): 3, zoom_key(k): 1}
+    if walk:
+        values.insert(NEAR, np.array([0.12]))
+        widths |= {NEAR: 1}
+    for k in range(2 if walk else 1):
+        values.insert(place_key(k, walk > 0.0), gtsam.Point3(likes[0].place + 0.03 * k))
+        widths |= {place_key(k, walk > 0.0): 3}
     far = Match(PLACES, likes[0].onto(PLACES, likes[1]) + 0.2, np.eye(3))
-    court, background = graph.CourtLines(likes, seen[:2], noise), graph.Background(likes, [far], noise)
+    court, background = CourtLines(likes, seen[:2], noise), Background(likes, [far], noise)
     for factor in (court.factor(0), court.factor(1), background.factor(0)):
         keys, column = factor.keys(), 0
         found = factor.linearize(values).jacobian()[0] * factor.noiseModel().sigma()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.background import matched
 from ballfg.vision.broadcast.candidates import aligned_candidates, find_candidates
 from ballfg.vision.broadcast.motion import Shot, find_motion
+from ballfg.vision.broadcast.pinhole import Pinhole
 from tests.commands import status
 
 SIDE = looking((0.5, -8.0, 3.5), (0.0, 0.0, 0.0), 1000.0)
@@ -124,3 +126,30 @@ def test_a_video_without_a_rally_is_refused_in_one_line_and_nothing_is_written(
     assert len(said) == 1
     assert message in said[0]
     assert [one.name for one in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def travelled(count: int, step: float) -> tuple[list[Pinhole], list[Image]]:
+    """Cameras that go to the left, m a picture, and turn, and what they see of a hall with walls and letters."""
+    rng = np.random.default_rng(9)
+    turned = panned(SIDE, count, 0.03, 0.0)
+    cameras = [replace(one, place=one.place - [step * k, 0.0, 0.0]) for k, one in enumerate(turned)]
+    return cameras, [picture(camera, rng) for camera in cameras]
+
+
+@pytest.mark.parametrize("step", [0.0, 0.012])
+def test_a_camera_that_moves_has_a_place_in_each_picture_and_one_that_stands_has_not(step: float) -> None:
+    cameras, images = travelled(30, step)
+    (shot,) = find_motion(lambda: iter([(0.04 * k, image) for k, image in enumerate(images)]), COURT, 30).shots
+    assert (shot.near > 0.0) == (shot.shifts is not None) == (step > 0.0)
+    off = np.array([one.place - true.place for one, true in zip(shot.cameras, cameras, strict=True)])
+    assert np.linalg.norm(off, axis=1).max() < 0.03 * np.linalg.norm(cameras[0].place)
+    if step:
+        along = np.array([one.place[0] for one in shot.cameras])
+        assert along[0] - along[-1] == pytest.approx(29 * step, rel=0.1)
+
+
+def test_a_background_of_known_distance_is_seen_from_another_place() -> None:
+    cameras, _ = travelled(2, 0.3)
+    pixels, far = np.array([[100.0, 80.0], [700.0, 400.0], [480.0, 270.0]]), 8.0
+    points = cameras[0].place + far * cameras[0].directions(pixels) @ cameras[0].turn
+    np.testing.assert_allclose(cameras[0].onto(pixels, cameras[1], 1.0 / far), cameras[1].project(points), atol=1e-9)

@@ -90,7 +90,7 @@ def test_an_orange_ball_before_a_blue_table_is_a_candidate_of_its_colour_alone()
     true = camera.project(places[2]).mean(axis=0)
     far = {}
     for colour in ("white", "orange"):
-        found = aligned_candidates(window, 2, (camera,) * 5, np.array([3.0, 8.0]), colour)
+        found = aligned_candidates(window, 2, (camera,) * 5, np.array([3.0, 8.0]), colour=colour)
         far[colour] = np.linalg.norm(found.pixels - true, axis=1).min(initial=np.inf)
     assert far["orange"] < 1.0
     assert far["white"] > 5.0
