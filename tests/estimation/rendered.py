@@ -1,6 +1,7 @@
 """Rendered rallies of `ballfg.benchmarks.cameras.rallies`, line by line.
 
     python -m tests.estimation.rendered --count 6 --seed 0 [--rate 60] [--view behind] [--varied] [--half]
+        [--hand] [--readout 0.4]
 
 prints what is found of each, and the sums. With `--half` the candidates are those of another detector: half of the
 balls, with a noise of a pixel, and twenty false ones in each picture.
@@ -17,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.cameras.rallies import VIEWS, CameraScore, Filmed, Score, Truth, rated
+from ballfg.benchmarks.cameras.films import VIEWS, Filmed, Truth
+from ballfg.benchmarks.cameras.rallies import CameraScore, Score, rated
 from ballfg.state import POSITION
 from ballfg.vision.broadcast.given import read_candidates
 from tests.vision.broadcast.own import write_candidates
@@ -45,11 +47,16 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=25.0, help="Hz")
     parser.add_argument("--view", choices=VIEWS, help="the same for all")
     parser.add_argument("--varied", action="store_true", help="halls of varied looks, pictures of varied sizes")
+    parser.add_argument("--hand", action="store_true", help="a camera in a hand that sways and walks")
+    parser.add_argument("--readout", type=float, default=0.0, help="of a rolling shutter, of the time between pictures")
     parser.add_argument("--half", action="store_true", help="candidates of another detector")
     given = parser.parse_args()
     scores, cameras = list[Score](), list[CameraScore]()
     for seed in range(given.seed, given.seed + given.count):
-        filmed, begun = Filmed(seed, given.rate, given.view, given.varied), time.process_time()
+        filmed, begun = (
+            Filmed(seed, given.rate, given.view, given.varied, given.hand, given.readout),
+            time.process_time(),
+        )
         of = filmed.truth
         with tempfile.TemporaryDirectory() as folder:
             table, stamps = Path(folder) / "candidates.csv", np.arange(len(of.cameras)) / given.rate

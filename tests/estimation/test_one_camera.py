@@ -16,7 +16,7 @@ from ballfg.estimation import Status
 from ballfg.estimation.one_camera import Strokes, track_one_camera
 from ballfg.estimation.rally.arcs import BENT, CARRIED, MOSTLY, arcs, telling
 from ballfg.estimation.rally.field import FLATTEST, Field, at_court
-from ballfg.estimation.rally.reconstruct import without_lens
+from ballfg.estimation.rally.reconstruct import search, without_lens
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Candidates, Detections
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
@@ -96,6 +96,20 @@ def test_what_does_not_fall_is_no_ball(ball: World) -> None:
     times, states = rally(ball)
     empty = seen(times, states, 4, hidden=1.1)
     assert track_one_camera(empty, SIDE, ball.model, ball.surfaces).estimates == ()
+
+
+def test_a_light_without_streaks_does_not_hide_those_of_the_ball(ball: World) -> None:
+    """The share of the time for which the shutter is open is that of the ball's streaks."""
+    times, states = rally(ball)
+    found, share = seen(times, states, 3, hidden=0.0), 0.5
+    rows = np.flatnonzero(np.isclose(found.scores, 0.9))
+    way = share / RATE * np.gradient(found.pixels[rows], found.times[rows], axis=0)
+    streaks = np.full_like(found.streaks, np.nan)
+    streaks[rows] = found.pixels[rows, None] + 0.5 * way[:, None] * np.array([[-1.0], [1.0]])
+    chosen, field = search(replace(found, streaks=streaks), SIDE, ball.model, ball.surfaces)
+    assert field is not None
+    assert field.exposure == pytest.approx(share, abs=0.1)
+    assert len(chosen.strokes) == 3
 
 
 def test_of_a_time_shift_nothing_changes(ball: World) -> None:

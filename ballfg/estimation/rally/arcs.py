@@ -96,6 +96,12 @@ def straight(field: Field, found: Sequence[Index]) -> Mask:
     return among
 
 
+def _flown(field: Field, found: Sequence[Index]) -> tuple[list[Index], Mask]:
+    """The arcs that may be flights, and `straight` of all."""
+    clutter = straight(field, found)
+    return [rows for rows in found if clutter[rows].mean() < MOSTLY], clutter
+
+
 def _steady(field: Field, rows: Index) -> bool:
     """True for candidates that differ from a straight and steady motion by noise alone."""
     since = field.stamps[field.frame[rows]]
@@ -142,14 +148,13 @@ def arcs(field: Field) -> tuple[list[Index], Field, Foretold]:
     used = np.zeros((len(field.frame), int(widest)), dtype=bool)
     every = [field.rows(frame) for frame in range(len(field.first) - 1)]
     found = _begun(field, every, (1,), used, tally)
-    long = sorted((rows for rows in found if len(rows) >= LEAST), key=lambda rows: -len(rows))
+    long, _ = _flown(field, sorted((rows for rows in found if len(rows) >= LEAST), key=lambda rows: -len(rows)))
     none = np.zeros(0, dtype=np.int64)
     field = replace(field, exposure=with_exposure(field.smooth(tally.density(none)), long).exposure)
     likeliest = [rows[np.argsort(field.density[rows], kind="stable")[:LIKELIEST]] for rows in every]
     found += _begun(field, likeliest, range(1, APART + 1), used, tally)
     found = [rows for rows in found if len(rows) >= LEAST or field.agree(rows, AGREE)]
-    clutter = straight(field, found)
-    found = [rows for rows in found if clutter[rows].mean() < MOSTLY]
+    found, clutter = _flown(field, found)
     return sorted(found, key=lambda rows: -len(rows)), field.without(clutter), tally.without(clutter)
 
 

@@ -26,6 +26,7 @@ from ballfg.progress import Watch, unwatched
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Track
+from ballfg.vision.broadcast.measured import Flow
 from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera import Camera
@@ -77,9 +78,14 @@ def fixed_camera(shot: Shot, name: str) -> tuple[Pinhole, Camera]:
 def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> Detections:
     """The candidates of a moving camera where one that looks another way sees them from the same place."""
     pixels, streaks, spread = found.pixels.copy(), found.streaks.copy(), found.covariances.copy()
+    flow = Flow(shot.cameras)
     for number, camera in enumerate(shot.cameras):
         rows = slice(*np.searchsorted(found.frame, (number, number + 1)))
-        pixels[rows], streaks[rows] = camera.onto(found.pixels[rows], onto), camera.onto(found.streaks[rows], onto)
+        if shot.readout:  # as the camera looked when these rows were seen, which is not when the middle one was
+            turned = shot.readout * flow.late(pixels[rows]) * flow.of_background(number, pixels[rows])
+            pixels[rows] -= turned
+            streaks[rows] -= turned[:, None]
+        pixels[rows], streaks[rows] = camera.onto(pixels[rows], onto), camera.onto(streaks[rows], onto)
         spread[rows] *= (onto.focal / camera.focal) ** 2
     seen: Mask = np.asarray(np.isfinite(pixels).all(axis=1))  # a wide pan leaves something behind
     spread += FRAME_SIGMA**2 * np.eye(2)
@@ -120,6 +126,8 @@ def reconstruct(
     """
     name = f"shot{shot.first}"
     pinhole, camera = fixed_camera(shot, name)
+    if shot.readout:
+        camera = replace(camera, readout=shot.readout * float(np.median(np.diff(found.frames))))
     seen = on_fixed_camera(found, shot, pinhole, name)
     return strokes_of(seen, camera, model, surfaces, first=first, seen_share=seen_share, play=True, watch=watch)
 

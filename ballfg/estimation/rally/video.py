@@ -51,6 +51,11 @@ class Rally:
             if shot.shifts is not None:
                 far = np.ptp(shot.shifts, axis=0).max()
                 notes.append(f"the camera of frame {shot.first} on moves, by {far:.2f} m: each picture has its place")
+        notes += [
+            f"the shutter of {one.camera.name} rolls: {1e3 * one.camera.readout:.1f} ms from the first row to the last"
+            for one in self.shots
+            if one.camera.readout
+        ]
         for one in self.shots:
             unsure = (estimate for estimate in one.estimates if estimate.status is not Status.OK)
             notes += [f"stroke {estimate.name}: {estimate.status.value}" for estimate in unsure]

@@ -26,9 +26,11 @@ from ballfg.vision.broadcast.measured import (
     LENS,
     LINES,
     NEAR,
+    READOUT,
     ROBUST,
     Background,
     CourtLines,
+    Flow,
     Noise,
     Unknowns,
     place_key,
@@ -54,29 +56,37 @@ PLACE_SIGMA, FOCAL_SIGMA, BEND_SIGMA, NEAR_SIGMA = 30.0, 1.0, 0.1, 0.1
 lenses of broadcasts have up to 0.2. Of one over the background's distance, 1/m, about none."""
 WALK, WALKS = 0.003, 2
 """m, from one picture to the next, at first, of a camera that moves; rounds in which it is found."""
-MOVES: Final = 3.0
-"""Logarithm of how much more probable it must be that a camera moves: most stand."""
+READOUTS: Final = 0.5
+"""Of the time between pictures, prior standard deviation of the readout of a rolling shutter, about none."""
+SURE: Final = 3.0
+"""Logarithm of how much more probable it must be that a camera moves or that its shutter rolls: most do neither."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
     """Cameras of a shot; covariances (n, 7, 7) of turn (rad, in the camera's frame), place (m), log focal length.
 
-    `near`: 1/m, one over the background's distance, of a camera that moves; 0 of one that stands.
+    `near`: 1/m, one over the background's distance, of a camera that moves; 0 of one that stands. `readout`: of the
+    time between pictures, from the first row to the last; 0 of a camera that sees all rows at once.
     """
 
     cameras: tuple[Pinhole, ...]
     covariances: Array
     near: float
+    readout: float
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """First values of a shot's cameras, ridges of each picture, and matches of each with the one before it."""
+    """First values of a shot's cameras, ridges of each picture, and matches of each with the one before it.
+
+    `flow`: of what stands still, which a rolling shutter shows; None where it does not roll.
+    """
 
     cameras: Sequence[Pinhole]
     seen: Sequence[Ridges | None]
     matched: Sequence[Match]
+    flow: Flow | None = None
 
     @property
     def lines(self) -> int:
@@ -115,8 +125,8 @@ class Fit:
         settings = gtsam.LevenbergMarquardtParams()
         settings.setMaxIterations(STEPS)
         settings.setRelativeErrorTol(tolerance)
-        court = CourtLines(problem.cameras, problem.seen, noise)
-        background = Background(problem.cameras, problem.matched, noise)
+        court = CourtLines(problem.cameras, problem.seen, noise, problem.flow)
+        background = Background(problem.cameras, problem.matched, noise, problem.flow)
         graph = _graph(court, background, problem.first(problem.cameras, moves=noise.moves), noise)
         found = gtsam.LevenbergMarquardtOptimizer(graph, start, settings).optimize()
         return cls(problem, noise, court, background, graph, found)
@@ -147,7 +157,7 @@ class Fit:
             keys = turn_key(k), place_key(k, self.noise.moves), zoom_key(k)
             joint = marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
             covariances.append(np.block([[joint.at(a, b) for b in keys] for a in keys]))
-        return Solved(self.cameras, np.stack(covariances), self.unknowns.near)
+        return Solved(self.cameras, np.stack(covariances), self.unknowns.near, self.unknowns.readout)
 
     def evidence(self) -> float:
         """Logarithm of the probability of the measurements, up to what all fits to them have with one noise of them.
@@ -158,6 +168,7 @@ class Fit:
         half = sum(float(np.log(np.abs(np.diag(bayes.at(i).R()))).sum()) for i in range(bayes.size()))
         steps = 3.0 * (len(self.problem.cameras) - 1)
         priors = steps * np.log(self.noise.walk) + np.log(NEAR_SIGMA) if self.noise.moves else 0.0
+        priors += np.log(self.noise.readout) if self.noise.readout else 0.0
         return -float(self.graph.error(self.values) + half + priors)
 
 
@@ -175,7 +186,8 @@ def solve(cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Se
         fit = Fit.of(problem, start, noise, ROUGH if number < ROUNDS - 1 else SETTLED)
         if number < ROUNDS - 1:
             noise, start = _noise(fit), fit.values
-    return (_moving(fit) or fit).solved()
+    fit = _moving(fit) or fit
+    return (_rolling(fit) or fit).solved()
 
 
 def _moving(stands: Fit) -> Fit | None:
@@ -186,13 +198,23 @@ def _moving(stands: Fit) -> Fit | None:
     for _ in range(WALKS):
         moves = Fit.of(stands.problem, start, replace(stands.noise, walk=walk), ROUGH)
         walk, start = _walk(moves), moves.values
-    if moves.evidence() < stands.evidence() + MOVES:
+    if moves.evidence() < stands.evidence() + SURE:
         return None
     for number in range(1, ROUNDS):
         noise = replace(_noise(moves), walk=walk)
         moves = Fit.of(stands.problem, moves.values, noise, ROUGH if number < ROUNDS - 1 else SETTLED)
         walk = _walk(moves) if number < ROUNDS - 1 else walk
     return moves
+
+
+def _rolling(plain: Fit) -> Fit | None:
+    """The fit of a camera whose rows are seen one after the other; None if it is not more probable."""
+    problem = replace(plain.problem, flow=Flow(plain.cameras, plain.unknowns.near))
+    start = gtsam.Values(plain.values)
+    start.insert(READOUT, np.zeros(1))
+    rolls = Fit.of(problem, start, replace(plain.noise, readout=READOUTS), SETTLED)
+    possible = abs(rolls.unknowns.readout) < 1.0  # else it would read into the next picture
+    return rolls if possible and rolls.evidence() > plain.evidence() + SURE else None
 
 
 def _walk(fit: Fit) -> float:
@@ -215,6 +237,8 @@ def _graph(court: CourtLines, background: Background, first: gtsam.Values, noise
     graph.add(gtsam.PriorFactorVector(LINES, np.zeros(lines), model.Sigma(lines, noise.lines)))
     for k in range(court.count):
         graph.add(gtsam.PriorFactorVector(zoom_key(k), first.atVector(zoom_key(k)), model.Sigma(1, FOCAL_SIGMA)))
+    if noise.readout:
+        graph.add(gtsam.PriorFactorVector(READOUT, np.zeros(1), model.Sigma(1, noise.readout)))
     if noise.moves:
         graph.add(gtsam.PriorFactorVector(NEAR, np.zeros(1), model.Sigma(1, NEAR_SIGMA)))
         still, walk = gtsam.Point3(0.0, 0.0, 0.0), model.Sigma(3, noise.walk)

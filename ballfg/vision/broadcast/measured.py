@@ -24,20 +24,22 @@ SHARED, TOGETHER = 10.0, 40.0
 count as one. Rendered seeds 700 - 718 and the real rally chose it."""
 ROBUST: Final = 2.0
 """Scale of Cauchy's loss, in standard deviations."""
-PLACE, LENS, LINES, NEAR = (gtsam.symbol(letter, 0) for letter in "plcw")
+LENS, LINES, NEAR, READOUT = (gtsam.symbol(letter, 0) for letter in "lcws")
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
     """Standard deviations, px: `ridges` (l,) of a ridge's place about its line, `lines` of the lines, `matches`.
 
-    `walk`: m, of each coordinate of the place from one picture to the next; 0 of a camera that stands.
+    `walk`: m, of each coordinate of the place from one picture to the next; 0 of a camera that stands. `readout`: of
+    the time between pictures, prior of that from the first row to the last; 0 of one that sees all rows at once.
     """
 
     ridges: Array
     lines: float
     matches: float
     walk: float = 0.0
+    readout: float = 0.0
 
     @property
     def moves(self) -> bool:
@@ -49,7 +51,7 @@ class Noise:
 class Unknowns:
     """Rotations (n, 3, 3) from the world and focal lengths (n,) px; places (n, 3) m, lens, shifts of the lines (l,) px.
 
-    `near`: 1/m, one over the distance of the background.
+    `near`: 1/m, one over the distance of the background. `readout`: of the time between pictures.
     """
 
     turn: Array
@@ -58,6 +60,7 @@ class Unknowns:
     bend: float
     off: Array
     near: float = 0.0
+    readout: float = 0.0
 
     @classmethod
     def of(cls, values: gtsam.Values, count: int) -> Unknowns:
@@ -66,8 +69,39 @@ class Unknowns:
         focal = np.exp([values.atVector(zoom_key(k))[0] for k in range(count)])
         moves = values.exists(NEAR)
         place = np.array([values.atPoint3(place_key(k, moves)) for k in range(count)])
-        near = float(values.atVector(NEAR)[0]) if moves else 0.0
-        return cls(turn, focal, place, float(values.atVector(LENS)[0]), values.atVector(LINES), near)
+        near, readout = (float(values.atVector(key)[0]) if values.exists(key) else 0.0 for key in (NEAR, READOUT))
+        return cls(turn, focal, place, float(values.atVector(LENS)[0]), values.atVector(LINES), near, readout)
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """How fast what stands still moves in the pictures of cameras, with a background at a distance 1 / `near`, m.
+
+    A row of a rolling shutter is seen later than the middle one by readout * `late`, and shows as much of this motion.
+    """
+
+    cameras: Sequence[Pinhole]
+    near: float = 0.0
+
+    def of_points(self, number: int, points: Array) -> Array:
+        """(n, 2) px from one picture to the next, of places (n, 3) m."""
+        first, last, steps = self._beside(number)
+        return np.asarray((self.cameras[last].project(points) - self.cameras[first].project(points)) / steps)
+
+    def of_background(self, number: int, pixels: Array) -> Array:
+        """(n, 2) px from one picture to the next, of what pixels (n, 2) show."""
+        first, last, steps = self._beside(number)
+        ends = [self.cameras[number].onto(pixels, self.cameras[k], self.near) for k in (first, last)]
+        return np.asarray((ends[1] - ends[0]) / steps)
+
+    def late(self, pixels: Array) -> Array:
+        """(n, 1) of the readout, by which rows of pixels (n, 2) are seen later than the middle one."""
+        return np.asarray((pixels[:, 1:] + 0.5) / self.cameras[0].size[1] - 0.5)
+
+    def _beside(self, number: int) -> tuple[int, int, int]:
+        """The pictures before and after, and how many are between them."""
+        first, last = max(number - 1, 0), min(number + 1, len(self.cameras) - 1)
+        return first, last, max(last - first, 1)
 
 
 def turn_key(k: int) -> int:
@@ -104,7 +138,7 @@ class Batch(ABC):
         keys: Sequence[list[int]],
     ) -> None:
         self.count, self.shared, self.sigma, self.pictures, self.keys = count, shared, sigma, pictures, keys
-        self.moves = noise.moves
+        self.moves, self.rolls = noise.moves, noise.readout > 0.0
         self.ends, self.marks = np.cumsum([0, *rows]), [b""] * len(keys)
         self.picture = np.repeat(np.array([seen[-1] for seen in pictures], dtype=np.int64), rows)
 
@@ -141,17 +175,20 @@ class Batch(ABC):
                 values.atPoint3(place_key(k, self.moves)),
             )
         ]
-        shared = [values.atVector(key) for key in (LENS, LINES, *([NEAR] if self.moves else []))]
+        shared = [values.atVector(key) for key in (LENS, LINES, *([NEAR] * self.moves), *([READOUT] * self.rolls))]
         return b"".join([np.asarray(part).tobytes() for part in (*own, *shared)])
 
 
 class CourtLines(Batch):
     """Ridges, across the lines. Args: cameras: from which those of the pictures differ little.  seen: as of `solve`."""
 
-    def __init__(self, cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], noise: Noise) -> None:
+    def __init__(
+        self, cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], noise: Noise, flow: Flow | None = None
+    ) -> None:
         used = [(k, one) for k, one in enumerate(seen) if one is not None and len(one.offset)]
         self.line: Index = np.concatenate([np.zeros(0, dtype=np.int64), *(one.line for _, one in used)])
-        keys = [[turn_key(k), place_key(k, noise.moves), zoom_key(k), LENS, LINES] for k, _ in used]
+        shared = [LENS, LINES, *([READOUT] if noise.readout else [])]
+        keys = [[turn_key(k), place_key(k, noise.moves), zoom_key(k), *shared] for k, _ in used]
         rows = [len(one.offset) for _, one in used]
         super().__init__(len(cameras), noise, SHARED, noise.ridges[self.line], [[k] for k, _ in used], rows, keys)
         self.points = np.concatenate([np.zeros((0, 3)), *(one.points for _, one in used)])
@@ -159,15 +196,20 @@ class CourtLines(Batch):
         away = [cameras[k].project(one.points) - cameras[k].middle for k, one in used]
         offset = np.concatenate([np.zeros(0), *(one.offset for _, one in used)])
         self.seen = (self.normal * np.concatenate([np.zeros((0, 2)), *away])).sum(axis=1) + offset
+        self.rolled = np.zeros(len(offset))
+        if flow is not None:
+            moved = [flow.late(cameras[k].project(one.points)) * flow.of_points(k, one.points) for k, one in used]
+            self.rolled = (self.normal * np.concatenate([np.zeros((0, 2)), *moved])).sum(axis=1)
 
     def left(self, at: Unknowns) -> tuple[Array, tuple[Array, ...]]:
-        """From the ridges to the lines; by turn, place, log focal length, lens, and shifts of the lines."""
+        """From the ridges to the lines; by turn, place, log focal length, lens, shifts of the lines, readout."""
         turn = at.turn[self.picture]
         place = (turn @ (self.points - at.place[self.picture])[..., None])[..., 0]
         across, by_place, by_lens = _across(place, at.focal[self.picture], at.bend, self.normal)
         moved, shifted = -(by_place[:, None] @ turn)[:, 0], np.eye(len(at.off))[self.line]
-        slopes = (np.cross(by_place, place), moved, across[:, None], by_lens, shifted)
-        return across + at.off[self.line] - self.seen, slopes
+        slopes = [np.cross(by_place, place), moved, across[:, None], by_lens, shifted]
+        slopes += [self.rolled[:, None]] if self.rolls else []
+        return across + at.off[self.line] - self.seen + at.readout * self.rolled, tuple(slopes)
 
 
 class Background(Batch):
@@ -177,7 +219,9 @@ class Background(Batch):
     w (p_(k-1) - p_k)) is its direction now. Of a camera that stands, w does not count.
     """
 
-    def __init__(self, cameras: Sequence[Pinhole], matched: Sequence[Match], noise: Noise) -> None:
+    def __init__(
+        self, cameras: Sequence[Pinhole], matched: Sequence[Match], noise: Noise, flow: Flow | None = None
+    ) -> None:
         pairs, middle = [[k, k + 1] for k in range(len(matched))], cameras[0].middle
         self.before = np.concatenate([np.zeros((0, 2)), *(one.before for one in matched)]) - middle
         self.now = (np.concatenate([np.zeros((0, 2)), *(one.now for one in matched)]) - middle).ravel()
@@ -186,11 +230,17 @@ class Background(Batch):
         if noise.moves:
             own = [[place_key(j, moves=True), place_key(k, moves=True), NEAR] for j, k in pairs]
             keys = [turned + moved for turned, moved in zip(keys, own, strict=True)]
+        keys = [[*mine, READOUT] for mine in keys] if noise.readout else keys
+        self.rolled = np.zeros(len(self.now))
+        if flow is not None:
+            seen = [((j, one.before), (k, one.now)) for (j, k), one in zip(pairs, matched, strict=True)]
+            ends = [[flow.late(px) * flow.of_background(i, px) for i, px in pair] for pair in seen]
+            self.rolled = np.concatenate([np.zeros((0, 2)), *(now - before for before, now in ends)]).ravel()
         rows = [2 * len(one.now) for one in matched]
         super().__init__(len(cameras), noise, TOGETHER, np.full(len(self.now), noise.matches), pairs, rows, keys)
 
     def left(self, at: Unknowns) -> tuple[Array, tuple[Array, ...]]:
-        """To where the points should be; by both turns and log focal lengths, lens, both places, nearness."""
+        """To where the points should be; by turns and log focal lengths, lens, places, nearness, readout."""
         turn = (at.turn[1:] @ at.turn[:-1].swapaxes(1, 2))[self.picture - 1]
         plane = undone(self.before / at.focal[self.picture[::2] - 1, None], at.bend)
         own = np.repeat(np.concatenate((plane, np.ones((len(plane), 1))), axis=1), 2, axis=0)
@@ -206,7 +256,8 @@ class Background(Batch):
         if self.moves:
             by_before = at.near * (by_place[:, None] @ now)[:, 0]
             slopes += [by_before, -by_before, (by_place * apart).sum(axis=1)[:, None]]
-        return across - self.now, tuple(slopes)
+        slopes += [self.rolled[:, None]] if self.rolls else []
+        return across - self.now + at.readout * self.rolled, tuple(slopes)
 
 
 def _across(place: Array, focal: Array, bend: float, normal: Array) -> tuple[Array, Array, Array]:

@@ -53,6 +53,7 @@ class Shot:
     Attributes: cameras: one a picture.  covariances: (n, 7, 7) of turn (rad, in the camera's frame), place (m), log
         focal length.  fit: (n,) share of the court's lines that fit.
         near: 1/m, one over the background's distance, of a camera that moves; 0: it stands at one place.
+        readout: of the time between pictures, from the first row to the last; 0: all rows are seen at once.
     """
 
     first: int
@@ -60,6 +61,7 @@ class Shot:
     covariances: Array
     fit: Array
     near: float = 0.0
+    readout: float = 0.0
 
     @property
     def shifts(self) -> Array | None:
@@ -219,7 +221,7 @@ def _followed(
         seen.append(lines if fit > FOLLOWED else None)
         fits.append(lines.fit)
     found: Solved = solve(cameras, seen, links)
-    return Shot(first, found.cameras, found.covariances, np.array(fits), found.near)
+    return Shot(first, found.cameras, found.covariances, np.array(fits), found.near, found.readout)
 
 
 def carried(camera: Pinhole, before: Array, now: Array) -> Pinhole:

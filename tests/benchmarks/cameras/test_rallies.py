@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.cameras.rallies import Score, add_rally, camera_judged, film, judged
+from ballfg.benchmarks.cameras.films import film
+from ballfg.benchmarks.cameras.rallies import Score, add_rally, camera_judged, judged
 from ballfg.benchmarks.results import Results
 from ballfg.estimation.rally.events import events_in_play
 from ballfg.estimation.rally.reconstruct import reconstruct

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.benchmarks.cameras.films import EXPOSURE, Truth, truth
 from ballfg.benchmarks.cameras.hall import COURT
-from ballfg.benchmarks.cameras.rallies import EXPOSURE, Truth, truth
 from ballfg.benchmarks.cameras.strokes import MODEL
 from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.field import Field

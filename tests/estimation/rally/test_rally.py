@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.cameras.films import Truth
 from ballfg.benchmarks.cameras.hall import COURT
-from ballfg.benchmarks.cameras.rallies import Truth
 from ballfg.benchmarks.cameras.strokes import MODEL
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, read_sighted

@@ -13,7 +13,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from ballfg.benchmarks.cameras.rallies import Truth
+from ballfg.benchmarks.cameras.films import Truth
 from ballfg.estimation.rally import hits as hits_of
 from ballfg.estimation.rally.arcs import Foretold
 from ballfg.estimation.rally.choose import BEGINS, MOST_BOUNCES, PAUSE, SERVED, VOLLEY, best_sequence

@@ -10,14 +10,16 @@ import pytest
 from ballfg.benchmarks.cameras.hall import COURT, looking, picture
 from ballfg.vision.broadcast import graph
 from ballfg.vision.broadcast.background import Match
-from ballfg.vision.broadcast.lines import CROSSING, FLANK, _brightest, brightness, ridges
+from ballfg.vision.broadcast.lines import CROSSING, FLANK, _brightest, brightness, moved, ridges
 from ballfg.vision.broadcast.measured import (
     LENS,
     LINES,
     NEAR,
+    READOUT,
     ROBUST,
     Background,
     CourtLines,
+    Flow,
     Noise,
     place_key,
     turn_key,
@@ -100,11 +102,11 @@ def test_no_ridge_is_sought_where_another_line_is_in_the_way(seen):
     assert 0 < len(middle) < 8 * 24
 
 
-@pytest.mark.parametrize("walk", [0.0, 0.01])
-def test_derivatives_of_the_factors_are_those_of_differences(seen, walk):
-    """Of ridges and background of two pictures, of a standing and a moving camera, and at new values anew."""
+@pytest.mark.parametrize(("walk", "readout"), [(0.0, 0.0), (0.01, 0.0), (0.01, 0.5)])
+def test_derivatives_of_the_factors_are_those_of_differences(seen, walk, readout):
+    """Of ridges and background of two pictures, of a standing, a moving, a rolling camera, and at new values anew."""
     likes = [looking((0.5, -7.02, 3.0), (0.02 * k, 0.0, 0.0), 1003.0 + 9.0 * k) for k in range(2)]
-    noise = Noise(np.linspace(0.05, 0.2, len(COURT.lines)), 0.03, 0.15, walk)
+    noise = Noise(np.linspace(0.05, 0.2, len(COURT.lines)), 0.03, 0.15, walk, readout)
     values, widths = gtsam.Values(), {LENS: 1, LINES: len(COURT.lines)}
     values.insert(LENS, np.array([-0.02]))
     values.insert(LINES, np.linspace(-0.3, 0.3, len(COURT.lines)))
@@ -115,11 +117,15 @@ def test_derivatives_of_the_factors_are_those_of_differences(seen, walk):
     if walk:
         values.insert(NEAR, np.array([0.12]))
         widths |= {NEAR: 1}
+    if readout:
+        values.insert(READOUT, np.array([0.3]))
+        widths |= {READOUT: 1}
+    flow = Flow(likes, 0.1) if readout else None
     for k in range(2 if walk else 1):
         values.insert(place_key(k, walk > 0.0), gtsam.Point3(likes[0].place + 0.03 * k))
         widths |= {place_key(k, walk > 0.0): 3}
     far = Match(PLACES, likes[0].onto(PLACES, likes[1]) + 0.2, np.eye(3))
-    court, background = CourtLines(likes, seen[:2], noise), Background(likes, [far], noise)
+    court, background = CourtLines(likes, seen[:2], noise, flow), Background(likes, [far], noise, flow)
     for factor in (court.factor(0), court.factor(1), background.factor(0)):
         keys, column = factor.keys(), 0
         found = factor.linearize(values).jacobian()[0] * factor.noiseModel().sigma()
@@ -134,3 +140,37 @@ def test_derivatives_of_the_factors_are_those_of_differences(seen, walk):
                 np.testing.assert_allclose(found[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-4, rtol=1e-5)
                 column += 1
         assert column == found.shape[1]
+
+
+@pytest.mark.parametrize("readout", [0.0, 0.5])
+def test_a_rolling_shutter_is_found_from_a_pan_that_changes(seen, readout):
+    """Each row is seen by the camera that turns on to its moment; nothing else is read from the pan."""
+    rng, count = np.random.default_rng(11), 40
+    angle = 0.06 * np.sin(np.arange(-1.0, count + 1.0) / 4.0)
+
+    def at(moment):
+        turn = np.interp(moment, np.arange(-1.0, count + 1.0), angle)
+        return moved(CAMERA, np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    def shown(number, points):
+        """Pixels of places (n, 3) m in a picture, each as the camera stands when its row is read."""
+        pixels = at(number).project(points)
+        for _ in range(5):
+            late = readout * ((pixels[:, 1] + 0.5) / CAMERA.size[1] - 0.5)
+            pixels = np.stack([at(number + one).project(point) for one, point in zip(late, points, strict=True)])
+        return pixels
+
+    cameras, links, court = [at(k) for k in range(count)], [], []
+    far = CAMERA.place + 12.0 * CAMERA.directions(rng.uniform((100, 50), (860, 490), (60, 2))) @ CAMERA.turn
+    for k, camera in enumerate(cameras):
+        off = shown(k, seen[0].points) - camera.project(seen[0].points)
+        ends = camera.project(COURT.lines)[seen[0].line]
+        along = ends[:, 1] - ends[:, 0]
+        normal = np.stack((-along[:, 1], along[:, 0]), axis=1) / np.linalg.norm(along, axis=1)[:, None]
+        court.append(replace(seen[0], normal=normal, offset=(normal * off).sum(axis=1) + rng.normal(0, 0.1, len(off))))
+        pair = [shown(one, far) + rng.normal(0.0, 0.1, far[:, :2].shape) for one in (max(k - 1, 0), k)]
+        links += [Match(*pair, np.eye(3))] if k else []
+    found = graph.solve(cameras, court, links)
+    assert found.readout == pytest.approx(readout, abs=0.1)
+    assert (found.readout == 0.0) == (readout == 0.0)
+    assert found.near == 0.0
