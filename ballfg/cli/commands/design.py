@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ballfg.tracks import Dataset
 
 SHOWN: Final = 20  # Places that are printed
+SHOTS: Final = 10  # Chosen by default
 
 
 def design(
@@ -46,9 +47,11 @@ def design(
         Path | None,
         typer.Option(help="Folder of a diagnosis: tell apart what it could not.", show_default="diagnose now"),
     ] = None,
-    shots: Annotated[int, typer.Option(help="Number of shots to choose.")] = 10,
+    shots: Annotated[int | None, typer.Option(help="Number of shots to choose.", show_default="10")] = None,
     out: Annotated[Path | None, typer.Option(help="Table of the shots, .csv or .parquet.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed, of the random shots to compare with.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Random seed, of the random shots to compare with.", show_default="0")
+    ] = None,
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
@@ -64,6 +67,7 @@ def design(
     """
     if stand is not None or candidates is None:
         shots_only = {"candidates": candidates, "between": between, "shrink": shrink, "diagnosis": diagnosis}
+        shots_only |= {"shots": shots, "seed": seed}
         inputs.know_observations(observations_file)
         _stand(dataset, stand, cameras, noise, model, effects_file, out, jobs, **shots_only)
         return
@@ -90,8 +94,8 @@ def design(
         levels,
         between=_pairs(between, shrink, diagnosis, opened.dataset, opened.model, jobs),
         shrink=shrink or "",
-        shots=shots,
-        seed=seed,
+        shots=SHOTS if shots is None else shots,
+        seed=seed or 0,
         jobs=jobs,
         watch=_say,
     )

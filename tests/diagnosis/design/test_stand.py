@@ -106,6 +106,8 @@ def test_the_command_prints_and_writes_places(
         (("--stand", "x=0,y=-4"), "--stand must name x, y and z; got x, y. Write x=-4..4:2"),
         (("--stand", "x=0,y=-4,z"), "--stand must read NAME=LEVEL"),
         (("--stand", "x=0,y=-4,z=2", "--candidates", "speed=8"), "--candidates is for shots, --stand for a camera."),
+        (("--stand", "x=0,y=-4,z=2", "--shots", "10"), "--shots is for shots, --stand for a camera."),
+        (("--stand", "x=0,y=-4,z=2", "--seed", "0"), "--seed is for shots, --stand for a camera."),
         ((), "--candidates or --stand must be given; got neither."),
         (("--candidates", "speed=8"), "--cameras is for --stand. Leave it out."),
         (("--stand", "x=0,y=-4,z=2", "--noise", "0"), "noise must be positive; got 0 px."),
