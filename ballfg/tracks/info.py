@@ -12,6 +12,7 @@ from ballfg.checks import (
     MAX_LISTED,
     check_name,
     check_number,
+    check_range,
     check_text,
     did_you_mean,
     is_text,
@@ -27,7 +28,7 @@ INFO_FILE = "dataset.yaml"
 NO_SURFACE = "none"  # in place of a table's height
 _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
-_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import", "doubts")
+_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import", "doubts", "lamp")
 
 # The largest plausible values in SI units; larger ones are almost surely in another unit.
 _RADII = (1e-4, 0.5)  # m
@@ -65,6 +66,23 @@ TENNIS = Ball(radius=0.0335, mass=0.0577)  # ITF Rules of Tennis, Appendix I, ty
 
 
 @dataclass(frozen=True)
+class Lamp:
+    """A lamp whose shadow of the ball on the table was seen. Raises: ValueError, TypeError: a place that is none."""
+
+    place: tuple[float, float, float]
+    """(x, y, z) m, in the frame of the dataset."""
+    sigma: float = 0.0
+    """m, standard deviation of each coordinate; 0: exact."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.place, tuple | list) or len(self.place) != 3:
+            raise TypeError(f"lamp.place must be three numbers in m; got {shown(self.place)}. Write [x, y, z].")
+        place = (check_number("lamp.place", one, "m", limit=MAX_HEIGHT, instead="mm") for one in self.place)
+        object.__setattr__(self, "place", tuple(place))
+        object.__setattr__(self, "sigma", check_range("lamp.sigma", self.sigma, 0.0, _MAX_POSITION_NOISE))
+
+
+@dataclass(frozen=True)
 class DatasetInfo:
     """The content of `dataset.yaml`. The frame's up axis is always z.
 
@@ -95,6 +113,8 @@ class DatasetInfo:
     """Origin and conversion of the tracks, as `ballfg import` records them in the section `import`; for people."""
     doubts: tuple[str, ...] = ()
     """What is not sure about the tracks, one line of text each; commands repeat it."""
+    lamp: Lamp | None = None
+    """Lamp of the shadows that the dataset holds."""
 
     def __post_init__(self) -> None:
         check_name("name", self.name)
@@ -154,6 +174,7 @@ class DatasetInfo:
             noise=None if content.get("noise") is None else TrackNoise.from_mapping(content["noise"]),
             imported=content.get("import"),
             doubts=() if content.get("doubts") is None else content["doubts"],
+            lamp=None if content.get("lamp") is None else _stated_lamp(content),
             **{key: content.get(key) for key in _OPTIONAL},
         )
 
@@ -169,6 +190,7 @@ class DatasetInfo:
         if self.noise is not None:
             content["noise"] = self.noise.to_mapping()
         content |= {"doubts": list(self.doubts)} if self.doubts else {}
+        content |= {"lamp": {"place": list(self.lamp.place), "sigma": self.lamp.sigma}} if self.lamp else {}
         return content if self.imported is None else content | {"import": dict(self.imported)}
 
 
@@ -235,6 +257,11 @@ def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], pr
     for name in fields:
         _need(section, name, f"{prefix}{key}.")
     return section
+
+
+def _stated_lamp(content: Mapping[str, Any]) -> Lamp:
+    lamp = _section(content, "lamp", {"place": "[x, y, z]"})
+    return Lamp(lamp["place"], lamp.get("sigma", 0.0))
 
 
 def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:

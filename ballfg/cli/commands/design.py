@@ -67,9 +67,8 @@ def design(
     """
     if stand is not None or candidates is None:
         shots_only = {"candidates": candidates, "between": between, "shrink": shrink, "diagnosis": diagnosis}
-        shots_only |= {"shots": shots, "seed": seed}
         inputs.know_observations(observations_file)
-        _stand(dataset, stand, cameras, noise, model, effects_file, out, jobs, **shots_only)
+        _stand(dataset, stand, cameras, noise, model, effects_file, out, jobs, shots=shots, seed=seed, **shots_only)
         return
     for name, value in (("cameras", cameras), ("noise", noise)):
         if value is not None:

@@ -14,6 +14,7 @@ from ballfg.checks import shown
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.rig import cameras_of, in_order, with_ends
+from ballfg.estimation.observations.shadows import SHADOWS_FILE, with_shadows
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks import csv_files
@@ -50,6 +51,7 @@ class SightedDataset(TrackFolder):
         labels: LabelTable,
         notes: list[str],
         bounces: Mapping[str, Array] = MappingProxyType({}),
+        shadows: Mapping[str, Sightings] = MappingProxyType({}),
     ) -> None:
         self.path, self.info, self.cameras, self.notes = path, info, cameras, notes
         self.label_names = labels.names
@@ -57,10 +59,12 @@ class SightedDataset(TrackFolder):
         model = nominal_model(info.ball)
         surfaces = replace(Surfaces.table_tennis(self.table), extent=info.table_extent)
         for name, sightings in balls.items():
-            known, own = bounces.get(name), labels.of(name)
-            seen = in_order(with_ends(sightings, cameras_of(sightings, cameras)), cameras)
+            known, own, rig = bounces.get(name), labels.of(name), list(cameras)
             try:
-                track = sighted_track(name, seen, cameras, own, model=model, surfaces=surfaces, bounces=known)
+                if name in shadows and info.lamp is not None:
+                    sightings, rig = with_shadows(sightings, shadows[name], cameras, info.lamp, self.table)
+                seen = in_order(with_ends(sightings, cameras_of(sightings, rig)), rig)
+                track = sighted_track(name, seen, rig, own, model=model, surfaces=surfaces, bounces=known)
                 self._tracks[name] = replace(track, dataset=self)
             except TooFewSightingsError as error:
                 notes.append(str(error))
@@ -100,7 +104,8 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
 
     Args:
         folder: holds `dataset.yaml`, `cameras.yaml`, `detections.csv` with the trajectory of each row, and optionally
-            `labels.csv` and `events.csv`, whose bounces of a ball that one camera saw are not searched for again.
+            `labels.csv`, `events.csv`, whose bounces of a ball that one camera saw are not searched for again, and
+            `shadows.csv`, with the columns of `detections.csv`: shadows on the table by the lamp in `dataset.yaml`.
     Returns: the balls that were seen often enough; `notes` list the others.
     Raises:
         FileNotFoundError: one of the files is missing.
@@ -115,14 +120,24 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
             )
     info, notes = read_info(path / INFO_FILE)
     cameras = tuple(read_cameras(path / CAMERAS_FILE))
-    balls, more = read_sightings(path / DETECTIONS_FILE, {camera.name: camera.time_offset for camera in cameras})
+    offsets = {camera.name: camera.time_offset for camera in cameras}
+    balls, more = read_sightings(path / DETECTIONS_FILE, offsets)
+    shadows = dict[str, Sightings]()
+    if (path / SHADOWS_FILE).is_file():
+        if info.lamp is None:
+            raise ValueError(
+                f"{path / INFO_FILE}: lamp is required beside {SHADOWS_FILE}; there is none. Write where the lamp "
+                "stands, in m, as lamp: {place: [0.5, 0.8, 3.1], sigma: 0.02}."
+            )
+        shadows, others = read_sightings(path / SHADOWS_FILE, offsets)
+        more += others
     for number, camera in enumerate(cameras):
         seen = [ball.pixels[ball.camera == number] for ball in balls.values()]
         check_inside(path / DETECTIONS_FILE, camera.name, camera.size, np.concatenate([np.empty((0, 2)), *seen]))
     labels_file = path / LABELS_FILE
     labels = read_labels(labels_file, list(balls)) if labels_file.is_file() else LabelTable({}, {})
     bounces = read_bounces(path / EVENTS_FILE) if (path / EVENTS_FILE).is_file() else {}
-    dataset = SightedDataset(path, info, cameras, balls, labels, [*notes, *more, *labels.notes], bounces)
+    dataset = SightedDataset(path, info, cameras, balls, labels, [*notes, *more, *labels.notes], bounces, shadows)
     if not len(dataset):
         raise ValueError(
             f"{path / DETECTIONS_FILE}: must hold a ball, seen often enough, its name in the column 'trajectory'; got "
