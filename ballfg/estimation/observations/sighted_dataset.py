@@ -60,9 +60,12 @@ class SightedDataset(TrackFolder):
         surfaces = replace(Surfaces.table_tennis(self.table), extent=info.table_extent)
         for name, sightings in balls.items():
             known, own, rig = bounces.get(name), labels.of(name), list(cameras)
-            try:
-                if name in shadows and info.lamp is not None:
+            if name in shadows and info.lamp is not None:
+                try:
                     sightings, rig = with_shadows(sightings, shadows[name], cameras, info.lamp, self.table)
+                except ValueError as error:
+                    raise ValueError(f"{path / SHADOWS_FILE}, trajectory {shown(name)}: {error}") from None
+            try:
                 seen = in_order(with_ends(sightings, cameras_of(sightings, rig)), rig)
                 track = sighted_track(name, seen, rig, own, model=model, surfaces=surfaces, bounces=known)
                 self._tracks[name] = replace(track, dataset=self)

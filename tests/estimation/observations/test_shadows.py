@@ -94,6 +94,9 @@ def test_a_dataset_with_shadows_knows_the_depth(tmp_path: Path, capsys: pytest.C
     info = read_info(folder / "dataset.yaml")[0]
     assert status("estimate", folder, "--from", "detections", "--out", tmp_path / "no.csv") == 2
     assert "lamp is required beside shadows.csv" in capsys.readouterr().err
+    write_info(folder / "dataset.yaml", replace(info, lamp=replace(LAMP, place=(0.0, 0.0, TABLE))))
+    assert status("estimate", folder, "--from", "detections", "--out", tmp_path / "no.csv") == 2
+    assert "shadows.csv, trajectory '000': lamp.place must be 0.1 m or more above" in capsys.readouterr().err
     errors, inside, widths = list[float](), list[np.ndarray](), list[float]()
     for sigma in (0.0, 0.1):
         lamp = replace(LAMP, sigma=sigma)
