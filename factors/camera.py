@@ -40,7 +40,14 @@ class CameraFactors(FactorBatch):
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = (
-        *("variables", "camera", "pixels", "root", "delay", "column", "radii", "shifts"),
+        "variables",
+        "camera",
+        "pixels",
+        "root",
+        "delay",
+        "column",
+        "radii",
+        "shifts",
     )
 
     def __init__(

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
+from ballfg.checks import listed, shown
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.rig import cameras_of, in_order, with_ends
@@ -127,12 +127,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     balls, more = read_sightings(path / DETECTIONS_FILE, offsets)
     shadows = dict[str, Sightings]()
     if (path / SHADOWS_FILE).is_file():
-        if info.lamp is None:
-            raise ValueError(
-                f"{path / INFO_FILE}: lamp is required beside {SHADOWS_FILE}; there is none. Write where the lamp "
-                "stands, in m, as lamp: {place: [0.5, 0.8, 3.1], sigma: 0.02}."
-            )
-        shadows, others = read_sightings(path / SHADOWS_FILE, offsets)
+        shadows, others = _read_shadows(path, info, offsets, balls)
         more += others
     for number, camera in enumerate(cameras):
         seen = [ball.pixels[ball.camera == number] for ball in balls.values()]
@@ -147,6 +142,26 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
             f"none ({len(balls)} named). Find balls with 'ballfg track', or look at the calibration."
         )
     return dataset
+
+
+def _read_shadows(
+    path: Path, info: DatasetInfo, offsets: Mapping[str, float], balls: Mapping[str, Sightings]
+) -> tuple[dict[str, Sightings], list[str]]:
+    """The shadows of balls in a folder, and notes on what is left out. Raises: ValueError: no lamp, no table."""
+    if info.lamp is None:
+        raise ValueError(
+            f"{path / INFO_FILE}: lamp is required beside {SHADOWS_FILE}; there is none. Write where the lamp "
+            "stands, in m, as lamp: {place: [0.5, 0.8, 3.1], sigma: 0.02}."
+        )
+    if info.table_height is None:
+        raise ValueError(
+            f"{path / INFO_FILE}: frame.table_height must be a number beside {SHADOWS_FILE}, whose shadows lie on the "
+            f"table; got none. Give it, or move {SHADOWS_FILE} away."
+        )
+    shadows, notes = read_sightings(path / SHADOWS_FILE, offsets)
+    if strange := [name for name in shadows if name not in balls]:
+        notes.append(f"{SHADOWS_FILE}: shadows of {listed(strange)} left out: no such ball in {DETECTIONS_FILE}")
+    return shadows, notes
 
 
 NEEDED: Final = (KEY, "t", "kind")

@@ -240,7 +240,7 @@ def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, s
     parts = np.zeros(len(rows), dtype=np.int64), seen.times[rows], seen.pixels[rows], seen.covariances[rows]
     bounces = written(stroke.bounces, float(seen.frames[0])) - camera.time_offset
     way = np.nan_to_num(seen.streaks[rows, 1] - seen.streaks[rows, 0])
-    shifts = None if seen.shift is None else seen.shift[rows]
+    shifts = None if seen.shifts is None else seen.shifts[seen.frame[rows]]
     sightings = with_ends(Sightings((camera.name,), *parts, streaks=way, shifts=shifts), [camera])
     return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)
 

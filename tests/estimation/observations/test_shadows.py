@@ -97,6 +97,13 @@ def test_a_dataset_with_shadows_knows_the_depth(tmp_path: Path, capsys: pytest.C
     write_info(folder / "dataset.yaml", replace(info, lamp=replace(LAMP, place=(0.0, 0.0, TABLE))))
     assert status("estimate", folder, "--from", "detections", "--out", tmp_path / "no.csv") == 2
     assert "shadows.csv, trajectory '000': lamp.place must be 0.1 m or more above" in capsys.readouterr().err
+    write_info(folder / "dataset.yaml", replace(info, lamp=LAMP, table_height=None, table_extent=None))
+    assert status("estimate", folder, "--from", "detections", "--out", tmp_path / "no.csv") == 2
+    assert "frame.table_height must be a number beside shadows.csv" in capsys.readouterr().err
+    write_info(folder / "dataset.yaml", replace(info, lamp=LAMP))
+    write_sightings(folder / "shadows.csv", [*cast_by.items(), ("elsewhere", next(iter(cast_by.values())))])
+    assert any("shadows of elsewhere left out" in note for note in read_sighted(folder).notes)
+    write_sightings(folder / "shadows.csv", list(cast_by.items()))
     errors, inside, widths = list[float](), list[np.ndarray](), list[float]()
     for sigma in (0.0, 0.1):
         lamp = replace(LAMP, sigma=sigma)
