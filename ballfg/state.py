@@ -15,5 +15,7 @@ VZ: Final = 5
 
 STATE_NAMES: Final = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
 SIGMA_NAMES: Final = tuple(f"sigma_{name}" for name in STATE_NAMES)
+CORRELATIONS: Final = {"rho_xy": (0, 1), "rho_xz": (0, 2), "rho_yz": (1, 2)}
+"""Columns of tables with the correlations of a position, and its coordinates."""
 
 STANDARD_GRAVITY: Final = 9.81  # m/s^2

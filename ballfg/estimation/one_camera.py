@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.rally.events import events_of
@@ -61,5 +62,10 @@ def track_one_camera(
         pairs.append((estimate, SeenBall(estimate.times, estimate.states[:, POSITION], spread, sightings, views)))
     pairs.sort(key=lambda pair: pair[0].name)
     events = events_of(found, model, surfaces, float(np.median(np.diff(seen.frames)))) if pairs else []
-    tracking = Tracking((camera,), (seen,), tuple(ball for _, ball in pairs), None)
+    bounces = dict[str, list[Array]]()
+    for event in events:
+        if event.kind == "bounce":
+            bounces.setdefault(event.trajectory, []).append(np.concatenate((event.place, event.sigmas)))
+    balls, places = tuple(ball for _, ball in pairs), {name: np.array(found) for name, found in bounces.items()}
+    tracking = Tracking((camera,), (seen,), balls, None, places)
     return Strokes(tracking, tuple(estimate for estimate, _ in pairs), tuple(events))

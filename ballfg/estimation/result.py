@@ -13,7 +13,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.prediction.forecast import Forecast
 from ballfg.prediction.state import BallState, World
-from ballfg.state import SIGMA_NAMES, STATE_DIM, STATE_NAMES
+from ballfg.state import CORRELATIONS, SIGMA_NAMES, STATE_DIM, STATE_NAMES
 
 if TYPE_CHECKING:
     import gtsam
@@ -226,6 +226,15 @@ class Estimate:
         words = np.array([label.name.lower() for label in Label], dtype=object)
         shown = words[self.labels if len(self.labels) else np.zeros(len(self), np.int8)]
         return {"t": self.times, **states, **sigmas, "label": shown}
+
+    @property
+    def correlations(self) -> dict[str, Array]:
+        """Further columns where cameras saw the ball, (n,) each: those of x and y, x and z, y and z.
+
+        Along the ray of a single camera the place is less sure than across it.
+        """
+        sigmas, pairs = self.sigmas, CORRELATIONS.items()
+        return {name: self.covariances[:, i, j] / (sigmas[:, i] * sigmas[:, j]) for name, (i, j) in pairs}
 
     def plot(self) -> "Figure":
         """A picture of position, velocity and spin over time, each with a band of two standard deviations."""

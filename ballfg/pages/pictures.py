@@ -47,10 +47,10 @@ def by_axis(shot: ShownShot) -> Figure:
     for a, panel in enumerate(panels):
         if len(shot.times):
             panel.plot(shot.times, shot.positions[:, a], ".", color=MEASURED, markersize=4, label="measured")
-        for label, times, places, sigmas in shot.lines:
+        for label, times, places, spread in shot.lines:
             if len(times):
-                colour = COLOURS[label]
-                width = HALF_WIDTH * np.where(np.isfinite(sigmas[:, a]), sigmas[:, a], np.nan)
+                colour, variance = COLOURS[label], spread[:, a, a]
+                width = HALF_WIDTH * np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
                 panel.plot(times, places[:, a], color=colour, linewidth=1.2, label=label)
                 panel.fill_between(
                     times, places[:, a] - width, places[:, a] + width, color=colour, alpha=0.2, linewidth=0
@@ -80,10 +80,10 @@ def _paths(panel: Axes, shot: ShownShot, across: int, up: int) -> None:
     view = [across, up]
     if len(shot.times):
         panel.plot(*shot.positions[:, view].T, ".", color=MEASURED, markersize=4, label="measured")
-    for label, _, places, sigmas in shot.lines:
+    for label, _, places, spread in shot.lines:
         if len(places):
             panel.plot(*places[:, view].T, color=COLOURS[label], linewidth=1.2, label=label)
-            bands = list(_bands(places[:, view], sigmas[:, view]))
+            bands = list(_bands(places[:, view], spread[:, view][:, :, view]))
             panel.add_collection(PolyCollection(bands, facecolor=COLOURS[label], alpha=0.25))
     for kind, (symbol, colour) in MARKERS.items():
         found = np.array([mark.place for mark in shot.marks if mark.kind == kind]).reshape(-1, 3)
@@ -91,14 +91,18 @@ def _paths(panel: Axes, shot: ShownShot, across: int, up: int) -> None:
             panel.plot(*found[:, view].T, symbol, color=colour, markersize=5, label=kind)
 
 
-def _bands(places: Array, sigmas: Array) -> Array:
-    """(m - 1, 4, 2) m, a quadrilateral of the band for each step; steps of unknown width are left out."""
+def _bands(places: Array, covariances: Array) -> Array:
+    """(m - 1, 4, 2) m, a quadrilateral of the band for each step; steps of unknown width are left out.
+
+    Args: places: (m, 2) m.  covariances: (m, 2, 2) m^2.
+    """
     if len(places) < 2:
         return np.zeros((0, 4, 2))
     along = np.gradient(places, axis=0)
     length = np.linalg.norm(along, axis=1, keepdims=True)
     across = np.stack((-along[:, 1], along[:, 0]), axis=1) / np.where(length > 0.0, length, 1.0)
-    offset = HALF_WIDTH * np.linalg.norm(across * sigmas, axis=1, keepdims=True) * across
+    variance = np.einsum("ni,nij,nj->n", across, covariances, across)
+    offset = HALF_WIDTH * np.sqrt(np.maximum(variance, 0.0))[:, None] * across
     low, high = places - offset, places + offset
     pieces = np.stack((low[:-1], low[1:], high[1:], high[:-1]), axis=1)
     return np.asarray(pieces[np.isfinite(pieces).all(axis=(1, 2))])

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
-from ballfg.state import POSITION, STANDARD_GRAVITY, VELOCITY, VZ, Z
+from ballfg.pages.sight import Sight
+from ballfg.state import CORRELATIONS, POSITION, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 NEAR = 0.05
 """m. A falling ball that would come this near to a surface before it rises again has met it; states err by less."""
@@ -92,6 +93,9 @@ class ShownShot:
     marks: tuple[Mark, ...] = ()  # contacts and hits in the states
     labels: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
     """(m,) what the ball does at each state; empty if unknown."""
+    correlations: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """(m, 3) of the states' x and y, x and z, y and z; empty if unknown: then they are taken as 0."""
+    sight: Sight | None = None  # how cameras saw the ball; None for measured positions
 
     @property
     def flying(self) -> list[bool] | None:
@@ -110,11 +114,22 @@ class ShownShot:
 
     @property
     def lines(self) -> list[tuple[str, Array, Array, Array]]:
-        """Name, stamps (k,) s, places (k, 3) m and their sigmas (k, 3) m of the estimate and of the prediction."""
+        """Name, stamps (k,) s, places (k, 3) m and covariances (k, 3, 3) m^2 of the estimate and of the prediction."""
+        estimated = covariances(self.state_sigmas[:, :3], self.correlations)
+        predicted = covariances(self.predicted_sigmas)
         return [
-            ("estimate", self.state_times, self.states[:, :3], self.state_sigmas[:, :3]),
-            ("prediction", self.predicted_times, self.predicted, self.predicted_sigmas),
+            ("estimate", self.state_times, self.states[:, :3], estimated),
+            ("prediction", self.predicted_times, self.predicted, predicted),
         ]
+
+    @property
+    def on_rays(self) -> "ShownShot":
+        """The shot with what stands for measured positions of a ball that one camera saw; itself for other balls."""
+        if self.sight is None or not self.sight.one_view:
+            return self
+        known = _at(self.times, self.state_times, self.states[:, :3])
+        positions, noise = self.sight.measured(np.where(np.isfinite(known), known, self.positions))
+        return replace(self, positions=positions, noise=noise)
 
     def residuals(self) -> Array:
         """(n, 3) m, measured less estimated; NaN at samples without a state."""
@@ -123,6 +138,20 @@ class ShownShot:
     def prediction_errors(self) -> Array:
         """(k, 3) m, measured less predicted; NaN without a measurement."""
         return _at(self.predicted_times, self.times, self.positions) - self.predicted
+
+
+def covariances(sigmas: Array, correlations: Array | None = None) -> Array:
+    """(k, 3, 3) m^2 of standard deviations (k, 3) m and correlations (k, 3) of x and y, x and z, y and z.
+
+    Without correlations, or with none, the coordinates are independent.
+    """
+    found = sigmas[:, :, None] * sigmas[:, None, :]
+    rho = np.zeros(sigmas.shape) if correlations is None or not len(correlations) else correlations
+    for number, (i, j) in enumerate(CORRELATIONS.values()):
+        share = rho[:, number]
+        found[:, i, j] *= share
+        found[:, j, i] *= share
+    return np.asarray(found)
 
 
 def _at(times: Array, known: Array, values: Array) -> Array:

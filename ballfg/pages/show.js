@@ -12,6 +12,8 @@ const BAND = page.half_width;
 const RING = 12;            // corners of a tube's cross-section
 const ARROWS = 14;          // spin axes that are drawn along a shot
 const SPIN_LENGTH = 0.001;  // m of an arrow for each rad/s
+const CAMERA = "#a6761d";
+const FARTHEST = 3;         // of a room's longest side: a camera beyond that stays outside of it, and its rays are cut
 const MARGIN = 0.4;         // m about the samples, the estimate and the table
 const CONFIG = {responsive: true, displaylogo: false, displayModeBar: false};
 
@@ -73,7 +75,7 @@ function surroundings() {
 }
 
 // A tube about a path: rings across the flight, as wide as the standard deviations in these directions.
-function tube(times, places, sigmas, scale, style) {
+function tube(times, places, sigmas, correlations, scale, style) {
   const rows = places[0].map((_, i) => i).filter(i => sigmas.every(s => s[i] !== null));
   if (rows.length < 2) return [];
   const x = [], y = [], z = [], faces = [[], [], []];
@@ -82,9 +84,12 @@ function tube(times, places, sigmas, scale, style) {
     const along = unit(places.map(p => p[after] - p[before]));
     const side = unit(Math.abs(along[2]) < 0.9 ? [along[1], -along[0], 0] : [0, along[2], -along[1]]);
     const up = cross(along, side);
+    const variance = spreadIn(sigmas.map(s => s[row]), correlations.map(r => r[row]));
+    const wide = Math.sqrt(Math.max(variance(side, side), 0)), both = wide > 0 ? variance(side, up) / wide : 0;
+    const high = Math.sqrt(Math.max(variance(up, up) - both * both, 0));
     for (let k = 0; k < RING; k++) {
       const c = Math.cos(2 * Math.PI * k / RING), s = Math.sin(2 * Math.PI * k / RING);
-      const at = [0, 1, 2].map(a => places[a][row] + scale * BAND * sigmas[a][row] * (c * side[a] + s * up[a]));
+      const at = [0, 1, 2].map(a => places[a][row] + scale * BAND * (c * wide * side[a] + (c * both + s * high) * up[a]));
       x.push(at[0]); y.push(at[1]); z.push(at[2]);
       if (number === 0 || times[row] - times[rows[number - 1]] > page.gap) continue;
       const a = RING * number + k, b = RING * number + (k + 1) % RING;
@@ -93,6 +98,36 @@ function tube(times, places, sigmas, scale, style) {
   });
   return [{type: "mesh3d", x, y, z, i: faces[0], j: faces[1], k: faces[2], opacity: 0.3, hoverinfo: "skip",
            flatshading: false, showlegend: true, ...style}];
+}
+
+// The covariance of what is left of a place in two directions.
+function spreadIn(sigmas, correlations) {
+  const [xy, xz, yz] = correlations.length ? correlations : [0, 0, 0], rho = [[1, xy, xz], [xy, 1, yz], [xz, yz, 1]];
+  return (u, v) => {
+    let sum = 0;
+    for (let a = 0; a < 3; a++) for (let b = 0; b < 3; b++) sum += u[a] * sigmas[a] * rho[a][b] * sigmas[b] * v[b];
+    return sum;
+  };
+}
+
+// Pyramids of the cameras that saw the shot, and some of their rays to the ball.
+function cameras() {
+  const traces = [];
+  for (const rays of shot.rays) {
+    const camera = page.cameras.find(one => one.name === rays.camera), [a, b, c, d] = camera.corners, p = camera.place;
+    const name = `camera ${camera.name}, ${distance(p).toFixed(1)} m away`, line = {color: CAMERA, width: 3};
+    traces.push(polyline([p, a, b, p, c, d, p, a, d, c, b], name, {line, showlegend: true}));
+    const path = axis => rays.from[axis].flatMap((from, i) => [from, rays.to[axis][i], null]);
+    traces.push({type: "scatter3d", mode: "lines", x: path(0), y: path(1), z: path(2), name: "its rays to the ball",
+                 line: {color: CAMERA, width: 1}, opacity: 0.6, hoverinfo: "skip"});
+  }
+  return traces;
+}
+
+// m from a place to the middle of the shot.
+function distance(place) {
+  const middle = pathPlaces().slice(0, 3).map(row => row[Math.floor(row.length / 2)]);
+  return Math.hypot(...place.map((value, a) => value - middle[a]));
 }
 
 function unit(v) {
@@ -171,15 +206,21 @@ function others(place) {
     .map(([label, tint, rows]) => place(label, tint, rows));
 }
 
-// From where to where each axis goes: about the samples, the estimate and the table. A prediction past a hit goes anywhere.
+const withCameras = () => element("cameras") !== null && element("cameras").value === "shown";
+
+// From where to where each axis goes: about the samples, the estimate and the table, and about cameras nearby that are
+// shown. A prediction past a hit goes anywhere.
 function room() {
   const table = page.table === null ? [[], [], []] : [page.table.extent.slice(0, 2), page.table.extent.slice(2),
                                                       [page.table.height, page.table.floor ?? page.table.height]];
   const known = shot.t.length || hasStates() ? [shot.positions, shot.states] : [shot.predicted];
-  return [0, 1, 2].map(a => {
-    const values = [...table[a], ...known.flatMap(rows => rows[a] ?? [])];
+  const around = places => [0, 1, 2].map(a => {
+    const values = [...table[a], ...known.flatMap(rows => rows[a] ?? []), ...places.map(place => place[a])];
     return [Math.min(...values) - MARGIN, Math.max(...values) + MARGIN];
   });
+  const seen = withCameras() ? shot.rays.map(rays => page.cameras.find(one => one.name === rays.camera).place) : [];
+  const longest = Math.max(...around([]).map(([low, high]) => high - low));
+  return around(seen.filter(place => distance(place) < FARTHEST * longest));
 }
 
 function drawSpace() {
@@ -194,7 +235,7 @@ function drawSpace() {
       `${Math.hypot(...velocity.map(v => v[i])).toFixed(2)} m/s${spread(shot.state_sigmas, i)}`;
     const style = {mode: "lines", name: "estimate", line: {color: ESTIMATE, width: 5}};
     traces.push(broken(cloud(places.map(flying), shot.state_t, words, style), shot.state_t));
-    traces.push(...tube(shot.state_t, places, shot.state_sigmas.map(flying), scale, {color: ESTIMATE, name: "its 90 % tube"}));
+    traces.push(...tube(shot.state_t, places, shot.state_sigmas.map(flying), shot.correlations, scale, {color: ESTIMATE, name: "its 90 % tube"}));
     traces.push(...others((label, tint, rows) => cloud(places.map(p => rows.map(i => p[i])), rows.map(i => shot.state_t[i]),
       t => `${label} at ${t.toFixed(4)} s`, {mode: "markers", name: label, marker: {size: 3.5, color: tint}})));
   }
@@ -202,9 +243,9 @@ function drawSpace() {
     const words = (t, i) => `predicted for ${t.toFixed(4)} s<br>${placeWords(shot.predicted, i)}${spread(shot.predicted_sigmas, i)}`;
     const style = {mode: "lines", name: "prediction", line: {color: PREDICTION, width: 5}};
     traces.push(broken(cloud(shot.predicted, shot.predicted_t, words, style), shot.predicted_t));
-    traces.push(...tube(shot.predicted_t, shot.predicted, shot.predicted_sigmas, scale, {color: PREDICTION, name: "90 % tube of a measurement"}));
+    traces.push(...tube(shot.predicted_t, shot.predicted, shot.predicted_sigmas, [], scale, {color: PREDICTION, name: "90 % tube of a measurement"}));
   }
-  traces.push(...marks(), ...spinArrows());
+  traces.push(...marks(), ...spinArrows(), ...(withCameras() ? cameras() : []));
   ballTrace = traces.length;
   traces.push({type: "scatter3d", mode: "markers", name: "ball at the chosen time", x: [0], y: [0], z: [0], hoverinfo: "skip",
                marker: {size: 8, color: "#f5a623", line: {color: "#333333", width: 1}}});
@@ -383,6 +424,7 @@ function choose(index) {
 if (page.shots.length) {
   element("shot").addEventListener("change", event => choose(event.target.selectedIndex));
   element("scale").addEventListener("change", () => { drawSpace(); showMoment(); });
+  if (element("cameras") !== null) element("cameras").addEventListener("change", () => { drawSpace(); showMoment(); });
   element("moment").addEventListener("input", () => { stop(); showMoment(); });
   element("play").addEventListener("click", play);
   choose(0);

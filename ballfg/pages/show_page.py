@@ -10,11 +10,13 @@ from ballfg.pages.html import Html, doubtful, explained, items, own, section, ta
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.shot import FLIGHT, GAP, HALF_WIDTH, LEVEL, ShownShot
 from ballfg.pages.shown import Shown
+from ballfg.pages.sight import near_picture
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 LENGTH_DECIMALS, TIME_DECIMALS, VELOCITY_DECIMALS, SPIN_DECIMALS = 5, 5, 3, 1
 """Digits after the point of m, s, m/s and rad/s in the page: 10 um is far below what trackers resolve."""
 SIGMA_DECIMALS = 6  # Digits of standard deviations in m: those of a state may be a tenth of a mm
+CORRELATION_DECIMALS = 6  # The depth of a ray is at most a thousand times less sure than its direction
 LARGEST = 8.0
 """Standard deviations beyond which a residual is drawn at the edge, so that an outlier does not hide the others."""
 CANDIDATES = 10  # Number of effects of a diagnosis in the drawing, those that explain most
@@ -72,11 +74,13 @@ def _flight(shown: Shown) -> Html:
     speeds = [
         tag("option", words, value=value) for words, value in (("a quarter", "0.25"), ("a tenth", "0.1"), ("real", "1"))
     ]
+    cameras = [tag("option", word) for word in _camera_choices(shown)]
     choice = tag(
         "div",
         tag("label", "Shot ", tag("select", *options, id="shot")),
         tag("label", "Tube ", tag("select", *scales, id="scale")),
         tag("label", "Speed ", tag("select", *speeds, id="speed")),
+        tag("label", "Cameras ", tag("select", *cameras, id="cameras")) if cameras else "",
         kind="controls",
     )
     moment = Html('<input type="range" id="moment" min="0" max="0" step="1" value="0" aria-label="time">')
@@ -84,7 +88,8 @@ def _flight(shown: Shown) -> Html:
     running = tag("div", tag("button", "Play", type="button", id="play"), time, kind="controls")
     words = (
         "Turn the picture with the mouse or a finger. Times count from the shot's first stamp. A tube holds "
-        "the central 90 % of each coordinate. What lies far from samples, estimate and table is cut off."
+        "the central 90 % of each direction across the flight. What lies far from samples, estimate and table is "
+        "cut off."
     )
     if shown.given.states is not None and shown.given.dataset is not None:
         words += " Contacts and hits are read off the states: where the ball turns up at a surface, and where it jumps."
@@ -92,6 +97,12 @@ def _flight(shown: Shown) -> Html:
         words += " Where the ball is held, rolls, rests or is lost the samples are drawn as measured, in other colours."
     space = _figure("space", "In space", words, "plot space")
     return section("The shot", choice, running, tag("p", "", kind="readout quiet", id="readout"), space)
+
+
+def _camera_choices(shown: Shown) -> list[str]:
+    """Whether cameras and rays are shown, the default first: those of one camera show where depth is not known."""
+    seen = [shot.sight for shot in shown.shots if shot.sight is not None]
+    return sorted(("hidden", "shown"), reverse=all(one.one_view for one in seen)) if seen else []
 
 
 def _measured_and_predicted(shown: Shown) -> Html:
@@ -196,6 +207,7 @@ def _data(shown: Shown) -> dict[str, Any]:
         "largest": LARGEST,
         "gap": GAP,
         "table": None if shown.table is None else _table(shown.table),
+        "cameras": _cameras(shown),
         "shots": [_shot(shot) for shot in shown.shots],
         "coverage": None
         if held is None or not len(held.horizons)
@@ -223,6 +235,24 @@ def _table(outline: Outline) -> dict[str, Any]:
     return {"height": outline.height, "extent": list(outline.extent), "net": net, "floor": outline.floor}
 
 
+def _cameras(shown: Shown) -> list[dict[str, Any]]:
+    """Each camera with its place and the corners of its picture."""
+    seen = [shot.sight for shot in shown.shots if shot.sight is not None]
+    found = {camera.name: camera for one in seen for camera in one.cameras}.values()
+    places = [(_plain(one.centre, LENGTH_DECIMALS), _plain(near_picture(one), LENGTH_DECIMALS)) for one in found]
+    return [
+        {"name": camera.name, "place": place, "corners": corners}
+        for camera, (place, corners) in zip(found, places, strict=True)
+    ]
+
+
+def _rays(shot: ShownShot) -> list[dict[str, Any]]:
+    """Rays of each camera that saw the ball, `from` and `to` (3, k) m."""
+    found = {} if shot.sight is None else shot.sight.some(shot.positions)
+    ends = {name: [_plain(places.T, LENGTH_DECIMALS) for places in both] for name, both in found.items()}
+    return [{"camera": name, "from": begin, "to": end} for name, (begin, end) in ends.items()]
+
+
 def _shot(shot: ShownShot) -> dict[str, Any]:
     start = shot.start
     states = [
@@ -242,6 +272,8 @@ def _shot(shot: ShownShot) -> dict[str, Any]:
         "states": states,
         "labels": shot.labels.tolist() if (shot.labels != FLIGHT).any() else [],
         "state_sigmas": _plain(shot.state_sigmas[:, :3].T, SIGMA_DECIMALS),
+        "correlations": _plain(shot.correlations.T, CORRELATION_DECIMALS) if shot.correlations.any() else [],
+        "rays": _rays(shot),
         "predicted_t": _plain(shot.predicted_times - start, TIME_DECIMALS),
         "predicted": _plain(shot.predicted.T, LENGTH_DECIMALS),
         "predicted_sigmas": _plain(shot.predicted_sigmas.T, SIGMA_DECIMALS),

@@ -10,6 +10,7 @@ from ballfg.checks import did_you_mean, shown
 from ballfg.pages.given import Given
 from ballfg.pages.outline import Outline, outline
 from ballfg.pages.shot import SAME_STAMP, Coverage, ShownShot, coverage, marks
+from ballfg.pages.sight import sight
 from ballfg.pages.tables import ResultTable
 from ballfg.tracks import Track
 
@@ -120,15 +121,18 @@ def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
     if track is not None:
         unknown = np.full(track.positions.shape, np.nan)
         noise = unknown if track.sigmas is None else track.sigmas
-        shot = replace(shot, times=track.times, positions=track.positions, noise=noise)
+        seen = sight(track) if track.rough else None
+        shot = replace(shot, times=track.times, positions=track.positions, noise=noise, sight=seen)
     if given.states is not None:
         rows = _rows(given.states, name, track)
         shot = replace(shot, state_times=rows[:, 0], states=rows[:, 1:10], state_sigmas=rows[:, 10:])
-        shot = replace(shot, labels=given.states.labels[given.states.rows.get(name, slice(0))])
+        which = given.states.rows.get(name, slice(0))
+        own = given.states
+        shot = replace(shot, labels=own.labels[which], correlations=own.correlations[which])
     if given.predictions is not None:
         rows = _rows(given.predictions, name, track)
         shot = replace(shot, predicted_times=rows[:, 0], predicted=rows[:, 1:4], predicted_sigmas=rows[:, 4:])
-    return shot
+    return shot.on_rays
 
 
 def _rows(table: ResultTable, name: str, track: Track | None) -> Array:
@@ -150,6 +154,11 @@ def _with_noise(given: Given, shots: list[ShownShot]) -> tuple[list[ShownShot], 
     assert given.dataset is not None
     info = given.dataset.info
     if given.dataset.rough:
+        if all(shot.sight is not None and shot.sight.one_view for shot in shots):
+            return shots, (
+                "One camera saw the ball: a sample is the point of its ray that is nearest to the estimate, and the "
+                "residuals are those across the rays, of one pixel's noise."
+            )
         return (
             shots,
             "The samples were triangulated from what the cameras saw; estimates use the pixels themselves.",

@@ -2,7 +2,7 @@
 
 import enum
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from ballfg.arrays import Array
 from ballfg.checks import NAME_RULE, is_name, one_line, shown
 from ballfg.files.parquet import open_parquet
 from ballfg.files.spreadsheet import bare
-from ballfg.state import SIGMA_NAMES, STATE_NAMES
+from ballfg.state import CORRELATIONS, SIGMA_NAMES, STATE_NAMES
 from ballfg.tracks import csv_files
 from ballfg.tracks.rows import distinct
 
@@ -40,6 +40,7 @@ class ResultTable:
     rows: Mapping[str, slice]  # of each track, in the order in which the tracks first appear
     values: Array  # (rows, 1 + c) t in s and the columns of the kind, sorted by track and time
     labels: NDArray[np.str_]  # (rows,) what the ball does at each state; empty without the column `label`
+    correlations: Array  # (rows, 3) of x and y, x and z, y and z of states; 0 where the table has none
 
     def of(self, name: str) -> Array:
         """(k, 1 + c) rows of a track in the units of the columns; empty for an unknown track."""
@@ -56,7 +57,8 @@ class ResultTable:
         ends = np.cumsum([0, *(sum(map(len, found)) for found in parts.values())]).tolist()
         rows_of = {name: slice(*pair) for name, pair in zip(parts, pairwise(ends), strict=True)}
         labels = self.labels[order] if len(self.labels) else self.labels
-        return replace(self, rows=rows_of, values=self.values[order], labels=labels)
+        ordered = (self.values[order], labels, self.correlations[order])
+        return ResultTable(self.path, self.kind, rows_of, *ordered)
 
 
 def kind_of(columns: Sequence[str]) -> Kind | None:
@@ -80,8 +82,9 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
 
     Raises: ValueError: no rows, text in place of a number, or a stamp that is not finite.
     """
-    names = [*KEYS, *kind.value]
-    labelled = kind is Kind.STATES and LABEL in columns_of(path)
+    names, there = [*KEYS, *kind.value], set(columns_of(path)) if kind is Kind.STATES else set[str]()
+    labelled, correlated = LABEL in there, there.issuperset(CORRELATIONS)
+    names += CORRELATIONS if correlated else ()
     text = pa.dictionary(pa.int32(), pa.string())
     types = {"trajectory": text} | dict.fromkeys(names[1:], pa.float64())
     types |= {LABEL: text} if labelled else {}
@@ -99,6 +102,8 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} must hold a number in each cell; {one_line(error)[:160]}. Correct it.") from None
     values = np.column_stack([found[name].to_numpy().astype(np.float64) for name in names[1:]])
+    end = 1 + len(kind.value)
+    correlations = np.nan_to_num(values[:, end:]) if correlated else np.zeros((len(values), len(CORRELATIONS)))
     if not len(values):
         raise ValueError(f"{path} must have rows; it has a header only. Give a table with results.")
     if not np.isfinite(values[:, 0]).all():
@@ -118,7 +123,8 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     ends = np.cumsum(np.bincount(codes, minlength=len(tracks))).tolist()
     rows = map(slice, [0, *ends], ends)
     labels = np.array(found[LABEL].to_pylist() if labelled else [], dtype=np.str_)
-    return ResultTable(path, kind, dict(zip(tracks, rows, strict=True)), values[order], labels[order[: len(labels)]])
+    ordered = (values[order, :end], labels[order[: len(labels)]], correlations[order])
+    return ResultTable(path, kind, dict(zip(tracks, rows, strict=True)), *ordered)
 
 
 def _as(column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:

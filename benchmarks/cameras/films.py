@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.cameras.hall import PLAIN, SIZE, Colour, Look, looking, panned, picture
+from ballfg.benchmarks.cameras.hall import PLAIN, SIZE, Colour, Look, hall, looking, panned, picture
 from ballfg.benchmarks.cameras.looks import SHIRTS, SIZES, drawn_look, judges
 from ballfg.benchmarks.cameras.strokes import STEP, TABLE, Scattered, drawn_ball, scattered
+from ballfg.dynamics import AnalyticModel
 from ballfg.state import POSITION, VZ
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.lines import moved
@@ -34,6 +35,12 @@ VIEWS: Final = {
     "near": ((-5.5, 0.9, 2.2), 800.0),
 }
 """Places, m, and focal lengths, px."""
+MINUTE: Final = 60.0
+"""s, of play before a camera that stands."""
+STANDING: Final = {"side": ((-0.2, -4.0, 1.44), 750.0), "oblique": ((-3.6, -3.0, 1.64), 750.0)}
+"""Its places, m, and focal lengths, px."""
+HIDDEN, BURSTS = 0.08, 25
+"""Of it: share of pictures in which something hides the ball, and number of further runs of two to four."""
 WALKED, SWAY = 0.2, ((0.3, 0.03), (0.9, 0.015), (1.7, 0.008))
 """Of a camera in a hand: m/s at most; Hz and m of its sway along each axis."""
 BANDS: Final = 9
@@ -48,6 +55,7 @@ class Truth:
 
     Attributes: judges: polygons and colours of people who sit.  shirts: of both players.
         readout: of the time between pictures, from the first row to the last.
+        hidden: numbers of pictures in which something hides the ball.
     """
 
     view: str
@@ -59,6 +67,7 @@ class Truth:
     judges: tuple[tuple[Array, Colour], ...] = ()
     shirts: tuple[Colour, Colour] = ((45, 45, 45), (45, 45, 45))
     readout: float = 0.0
+    hidden: frozenset[int] = frozenset()
 
     @property
     def bounces(self) -> list[float]:
@@ -80,19 +89,42 @@ class Truth:
 
 
 def truth(view: str, rate: float, seed: int) -> Truth:
-    """Strokes of a rally, each from where the one before ends, and a camera that follows a little."""
-    rng, now, found = np.random.default_rng(seed), 0.6, list[Scattered]()
-    ball = drawn_ball(rng)
-    side = float(rng.choice([-1, 1]))
-    place = np.array([side * 1.5, rng.uniform(-0.4, 0.4), TABLE + 0.25])
-    while now < LENGTH - 1.0 and (drawn := scattered(now, place, -side, ball, rng)) is not None:
-        found.append(drawn)
-        place, now, side = drawn.at(drawn.end)[POSITION], drawn.end, -side
+    """Strokes of a rally, and a camera that follows a little."""
+    rng = np.random.default_rng(seed)
+    found = _point(0.6, LENGTH - 1.0, drawn_ball(rng), rng)
     centre, focal = VIEWS[view]
     first = looking(np.add(centre, rng.normal(0.0, 0.3, 3)).tolist(), (0.0, 0.0, 0.1), focal * rng.uniform(*ZOOM))
     cameras = panned(first, int(LENGTH * rate), rng.normal(0.0, 0.06), rng.normal(0.0, 0.05))
     shaken = [moved(one, np.append(rng.normal(0.0, SHAKE, 3), np.zeros(4))) for one in cameras]
     return Truth(view, tuple(found), tuple(shaken), rng.uniform(*LIGHT), int(rng.integers(*QUALITY)))
+
+
+def minute(view: str, rate: float, seed: int) -> Truth:
+    """Points of a minute with pauses between them, and a camera that stands."""
+    rng, now, found = np.random.default_rng([seed, 5]), 0.6, list[Scattered]()
+    ball, count = drawn_ball(rng), int(MINUTE * rate)
+    while now < MINUTE - 2.0:
+        found += _point(now, MINUTE - 1.0, ball, rng, most=int(rng.integers(3, 10)))
+        now = found[-1].end + rng.uniform(1.5, 3.0)
+    runs = [first + np.arange(rng.integers(2, 5)) for first in rng.integers(0, count, BURSTS)]
+    hidden = np.concatenate([*runs, np.flatnonzero(rng.uniform(size=count) < HIDDEN)])
+    centre, focal = STANDING[view]
+    cameras = (looking(centre, (0.0, 0.0, 0.14), focal),) * count
+    light, quality = rng.uniform(*LIGHT), int(rng.integers(*QUALITY))
+    return Truth(view, tuple(found), cameras, light, quality, hidden=frozenset(hidden.tolist()))
+
+
+def _point(
+    now: float, end: float, ball: AnalyticModel, rng: np.random.Generator, most: int | None = None
+) -> list[Scattered]:
+    """Strokes from a time on, none that begins after `end`, s, each from where the one before ends."""
+    found = list[Scattered]()
+    side = float(rng.choice([-1, 1]))
+    place = np.array([side * 1.5, rng.uniform(-0.4, 0.4), TABLE + 0.25])
+    while now < end and len(found) != most and (drawn := scattered(now, place, -side, ball, rng)) is not None:
+        found.append(drawn)
+        place, now, side = drawn.at(drawn.end)[POSITION], drawn.end, -side
+    return found
 
 
 def varied(of: Truth, seed: int) -> Truth:
@@ -117,10 +149,11 @@ def held(of: Truth, rate: float, seed: int) -> Truth:
 
 def pictures(of: Truth, rate: float, seed: int) -> Iterator[Image]:
     """The pictures, with two players who sway behind the ends of the table."""
-    rng = np.random.default_rng([seed, 1])
+    rng, stands = np.random.default_rng([seed, 1]), all(one is of.cameras[0] for one in of.cameras)
+    empty = hall(of.cameras[0], of.look) if stands else None
     for number, camera in enumerate(of.cameras):
         if of.readout == 0.0:
-            image = _seen(of, camera, number / rate, rate, rng)
+            image = _seen(of, camera, number / rate, rate, rng, shown=number not in of.hidden, empty=empty)
         else:
             height = camera.size[1]
             bands = np.array_split(np.arange(height), BANDS)
@@ -132,11 +165,23 @@ def pictures(of: Truth, rate: float, seed: int) -> Iterator[Image]:
         yield np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), dtype=np.uint8)
 
 
-def _seen(of: Truth, camera: Pinhole, t: float, rate: float, rng: np.random.Generator) -> Image:
-    """What a camera sees at a time t, s."""
+def _seen(
+    of: Truth,
+    camera: Pinhole,
+    t: float,
+    rate: float,
+    rng: np.random.Generator,
+    *,
+    shown: bool = True,
+    empty: Image | None = None,
+) -> Image:
+    """What a camera sees at a time t, s.
+
+    Args: shown: whether nothing hides the ball.  empty: as of `picture`.
+    """
     half = 0.5 * EXPOSURE / rate
     ends = [of.at(t - half), of.at(t + half)]
-    bar = [one[POSITION] for one in ends if one is not None]
+    bar = [one[POSITION] for one in ends if one is not None and shown]
     others = list(of.judges)
     for end, shirt in zip((-1.0, 1.0), of.shirts, strict=True):
         sway = 0.35 * np.sin(2.0 * t + end) + 0.1 * np.sin(7.0 * t) - 0.5 * (of.view == "near")
@@ -144,7 +189,7 @@ def _seen(of: Truth, camera: Pinhole, t: float, rate: float, rng: np.random.Gene
             box = [(end * 2.3, sway + y, z) for y, z in ((-wide, low), (wide, low), (wide, high), (-wide, high))]
             if of.view != "behind" or end > 0.0:  # there he would hide most of the table
                 others.append((np.array(box), colour))
-    return picture(camera, rng, [np.stack(bar)] if len(bar) == len(ends) else [], others, look=of.look)
+    return picture(camera, rng, [np.stack(bar)] if len(bar) == len(ends) else [], others, look=of.look, empty=empty)
 
 
 def _between(of: Truth, number: float) -> Pinhole:
@@ -167,7 +212,7 @@ def film(of: Truth, path: Path, rate: float, seed: int) -> None:
 class Filmed:
     """A rally to film: its seed, Hz, its view (None: that of its seed), and whether its look is drawn.
 
-    And whether the camera is in a hand, and its readout, of the time between pictures.
+    And whether the camera is in a hand, its readout, of the time between pictures, and whether it stands for a minute.
     """
 
     seed: int
@@ -176,10 +221,13 @@ class Filmed:
     varied: bool = False
     by_hand: bool = False
     readout: float = 0.0
+    stands: bool = False
 
     @property
     def truth(self) -> Truth:
         """What happens in it."""
+        if self.stands:
+            return minute(self.view or list(STANDING)[self.seed % len(STANDING)], self.rate, self.seed)
         plain = truth(self.view or list(VIEWS)[self.seed % len(VIEWS)], self.rate, self.seed)
         plain = varied(plain, self.seed) if self.varied else plain
         plain = held(plain, self.rate, self.seed) if self.by_hand else plain

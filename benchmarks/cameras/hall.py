@@ -79,14 +79,14 @@ def picture(
     others: Sequence[tuple[Array, Colour]] = (),
     court: Court = COURT,
     look: Look = PLAIN,
+    empty: Image | None = None,
 ) -> Image:
     """A table with lines and a net, on a floor with marks; balls (2, 3) m, ends of their bars.
 
     Args: others: polygons (n, 3) m and their colours, of what stands before or behind the table.
+        empty: the hall as the camera sees it; None: it is drawn.
     """
-    width, height = camera.size
-    image = np.full((height, width, 3), look.wall, dtype=np.uint8)
-    _hall(image, camera, look)
+    image = hall(camera, look) if empty is None else empty.copy()
     far = float(np.linalg.norm(camera.place))
     for shown, colour in others:
         if np.linalg.norm(shown.mean(axis=0) - camera.place) > far:
@@ -105,8 +105,10 @@ def picture(
     return np.asarray(np.clip(noisy, 0, 255), dtype=np.uint8)
 
 
-def _hall(image: Image, camera: Pinhole, look: Look) -> None:
-    """Draws the floor, with marks as of letters and wear, and barriers with white letters around it."""
+def hall(camera: Pinhole, look: Look) -> Image:
+    """The floor, with marks as of letters and wear, and barriers with white letters around it."""
+    width, height = camera.size
+    image = np.full((height, width, 3), look.wall, dtype=np.uint8)
     marks = np.random.default_rng(5)
     if look.floor != look.wall:
         for x, y in product(np.arange(-12.0, 12.0, 2.0), np.arange(-12.0, 16.0, 2.0)):  # one may lie behind the camera
@@ -117,11 +119,16 @@ def _hall(image: Image, camera: Pinhole, look: Look) -> None:
         level = marks.uniform(70, 170)
         corners = np.array([[x, y], [x + 0.5, y], [x + 0.4, y + 0.3], [x, y + 0.3]]) + marks.uniform(-0.1, 0.1, (4, 2))
         _filled(image, camera, np.column_stack((corners, np.full(4, FLOOR))), (level, level, level))
-    if look.barriers is None:
-        return
+    if look.barriers is not None:
+        _barriers(image, camera, look.barriers, marks)
+    return image
+
+
+def _barriers(image: Image, camera: Pinhole, colour: Colour, marks: np.random.Generator) -> None:
+    """Draws barriers with white letters."""
     for middle, along in BARRIERS:
         one = partial(_upright, np.array(middle), np.array(along))
-        _filled(image, camera, one(-1.0, 1.0, 0.0, 0.7), look.barriers)
+        _filled(image, camera, one(-1.0, 1.0, 0.0, 0.7), colour)
         for begin in np.arange(-0.8, 0.8, 0.12):
             _filled(image, camera, one(begin, begin + marks.uniform(0.03, 0.1), 0.25, 0.5), (235, 235, 235))
 

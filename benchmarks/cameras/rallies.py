@@ -1,6 +1,6 @@
-"""Judges rendered rallies of one moving camera against the truth: what is found, and how far off it is."""
+"""Judges rendered rallies of one camera, moving or not, against the truth: what is found, and how far off it is."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,13 +14,19 @@ from ballfg.benchmarks.cameras.hall import COURT
 from ballfg.benchmarks.cameras.strokes import MODEL
 from ballfg.benchmarks.metrics import median_and_quartiles, median_and_range, share
 from ballfg.benchmarks.results import Results, in_processes
-from ballfg.estimation.rally.video import OwnCandidates, Rally, track_moving_camera
+from ballfg.estimation.one_camera import track_one_camera
+from ballfg.estimation.rally.moments import Event
+from ballfg.estimation.rally.video import OwnCandidates, surfaces_of, track_moving_camera
+from ballfg.estimation.result import Estimate
 from ballfg.state import POSITION, SPIN
 from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.detection.video import open_video
+from ballfg.vision.tracking.pipeline import detect_videos
 
 BOUNCE: Final = 0.02
 """s, within which a bounce is found."""
+STANDING_RATE: Final = 50.0
+"""Hz, of a camera that stands."""
 SPUN: Final = 60.0
 """rad/s of top- or backspin whose sign counts."""
 
@@ -64,10 +70,10 @@ def camera_judged(shot: Shot, of: Truth) -> CameraScore:
     return CameraScore(float(np.linalg.norm(off) / np.linalg.norm(true.place)), float(np.abs(focal).max()), held)
 
 
-def judged(rally: Rally, of: Truth) -> Score:
-    """A rally against the truth."""
+def judged(estimates: Iterable[Estimate], events: Iterable[Event], of: Truth) -> Score:
+    """The strokes and events of a rally against the truth."""
     found, false, errors, held, spins = set[int](), 0, list[float](), list[bool](), np.zeros(4, dtype=int)
-    for estimate in (one for shot in rally.shots for one in shot.estimates):
+    for estimate in estimates:
         middle = float(np.median(estimate.times))
         numbers = [i for i, one in enumerate(of.strokes) if one.begin < middle <= one.end]
         states = ((i, of.at(float(t))) for i, t in enumerate(estimate.times))
@@ -85,7 +91,7 @@ def judged(rally: Rally, of: Truth) -> Score:
         if abs(state[SPIN][1]) > SPUN:
             right, known = bool(np.sign(state[SPIN][1]) == np.sign(spin)), bool(abs(spin) > 2.0 * sigma)
             spins += (right, 1, right and known, known)
-    bounces = [event.t for event in rally.events if event.kind == "bounce"]
+    bounces = [event.t for event in events if event.kind == "bounce"]
     near = sum(any(abs(t - true) < BOUNCE for t in bounces) for true in of.bounces)
     return Score(len(of.strokes), len(found), false, errors, held, tuple(spins.tolist()), (near, len(of.bounces)))
 
@@ -101,7 +107,20 @@ def rated(filmed: Filmed, candidates: OwnCandidates | None = None) -> tuple[Scor
             rally = track_moving_camera(video.frames, COURT, MODEL, count=video.count, candidates=candidates)
         except ValueError:  # no court: nothing is found
             return Score(len(of.strokes), 0, 0, [], [], (0, 0, 0, 0), (0, len(of.bounces))), None
-    return judged(rally, of), camera_judged(rally.motion.shots[0], of)
+    estimates = [one for shot in rally.shots for one in shot.estimates]
+    return judged(estimates, rally.events, of), camera_judged(rally.motion.shots[0], of)
+
+
+def rated_standing(filmed: Filmed) -> Score:
+    """The score of a minute before a camera that stands and is calibrated, as `ballfg track` finds it."""
+    of = filmed.truth
+    camera = of.cameras[0].camera(of.view)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "minute.mp4"
+        film(of, path, filmed.rate, filmed.seed)
+        (seen,) = detect_videos({of.view: path}, [camera])
+    strokes = track_one_camera(seen, camera, MODEL, surfaces_of(COURT))
+    return judged(strokes.estimates, strokes.events, of)
 
 
 def run_rallies(results: Results, counts: Mapping[float, int], jobs: int) -> None:
@@ -116,6 +135,14 @@ def run_rallies(results: Results, counts: Mapping[float, int], jobs: int) -> Non
         add("found", "1", share([camera is not None for _, camera in pairs]), count)
         add("place_error", "1", median_and_range([one.place for one in cameras] or [np.nan]), len(cameras))
         add("focal_error", "1", median_and_range([one.focal for one in cameras] or [np.nan]), len(cameras))
+
+
+def run_standing(results: Results, count: int, jobs: int) -> None:
+    """Adds the rows of minutes before a camera that stands, so many of them."""
+    every = [Filmed(results.seed + number, STANDING_RATE, stands=True) for number in range(count)]
+    if every:
+        scores = in_processes(rated_standing, every, jobs, "minutes of a camera that stands drawn and tracked")
+        add_rally(results, f"a camera that stands, minutes at {STANDING_RATE:g} Hz", scores)
 
 
 def add_rally(results: Results, case: str, scores: Sequence[Score]) -> None:

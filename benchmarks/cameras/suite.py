@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, Velocities, clocks, compare, sighted
-from ballfg.benchmarks.cameras.rallies import run_rallies
+from ballfg.benchmarks.cameras.rallies import run_rallies, run_standing
 from ballfg.benchmarks.cameras.scenes import Filmed, Judged, Scenario, film, judge, scenarios
 from ballfg.benchmarks.metrics import bootstrap, median_and_quartiles, median_and_range, pooled_rms, ratio, share
 from ballfg.benchmarks.pictures import BLUE, ORANGE, save
@@ -143,17 +143,18 @@ class Size:
 
     Attributes:
         shots: balls in each recording.  late: recordings with a late clock.
-        rallies: of a camera that pans and zooms, at each rate, Hz.
+        rallies: of a camera that pans and zooms, at each rate, Hz.  minutes: of a camera that stands.
         speed_runs: times that the streams are timed; the median counts.
     """
 
     shots: int
     late: int
     rallies: Mapping[float, int]
+    minutes: int = 0
     speed_runs: int = 3
 
 
-FULL: Final = Size(shots=8, late=3, rallies={25.0: 4, 60.0: 2})
+FULL: Final = Size(shots=8, late=3, rallies={25.0: 4, 60.0: 2}, minutes=2)
 QUICK: Final = Size(shots=2, late=1, rallies={25.0: 1})
 
 
@@ -177,6 +178,7 @@ def run_cameras(results: Results, out: Path, size: Size, jobs: int) -> list[Path
     add_turns(results, turned, shown[0])
     _add_speed(results, ways[0], shown[1], size.speed_runs)
     run_rallies(results, size.rallies, jobs)
+    run_standing(results, size.minutes, jobs)
     return [
         errors_picture({name: found.errors for name, found in judged.items()}, out / "cameras_errors.png"),
         turns_picture(turned, out / "cameras_turned.png"),

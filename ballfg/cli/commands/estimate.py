@@ -104,6 +104,7 @@ def _estimated(model: "BallModel", estimator: "Estimator", track: "Track") -> _E
     for part in in_sections(estimator, track):
         share = out_of_distribution(model, part.states)
         own: dict[str, str | np.ndarray] = {"trajectory": part.name, **part.columns}
+        own |= part.correlations if track.rough else {}
         columns.append(own if share is None else own | {"outside": share})
         shares += [] if share is None else [float(share.sum())]
         notes += part.notes

@@ -155,6 +155,8 @@ def strokes_of(
     if field is None:
         return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
+    if not play:
+        chosen = _balls(smoother, seen, camera, chosen)
     kinked = _kinked(chosen, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), chosen, kinked)
     seen = _with_noise(seen, noise, kinked)
@@ -202,6 +204,21 @@ def search(
         if abs(plain.seen - field.seen) < SETTLED and before < THINNER * density:
             break
     return chosen, field
+
+
+def _balls(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen) -> Chosen:
+    """The strokes that are a ball's: those that bounce, and those whose fall tells how far away they are.
+
+    A shoe that sways or a hand that waves moves as smoothly as a ball. What falls like none has no estimate, or one
+    whose depth is not known, somewhere before the camera.
+    """
+    ball = [bool(stroke.bounces) for stroke in chosen.strokes]
+    for number in (number for number, bounces in enumerate(ball) if not bounces):
+        track = _track(chosen.strokes[number], seen, camera, smoother.model, smoother.surfaces)
+        ball[number] = smoother.estimate(track).status is Status.OK
+    kept = [number for number, is_ball in enumerate(ball) if is_ball]
+    joined = tuple(chosen.joined[number] and ball[number - 1] for number in kept)
+    return Chosen(tuple(chosen.strokes[number] for number in kept), chosen.probabilities[kept], joined)
 
 
 def _kinked(chosen: Chosen, field: Field) -> Mask:

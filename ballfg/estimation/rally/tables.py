@@ -74,13 +74,6 @@ def write_rally(
         return [name for name in FILES if (stage / name).is_file()]
 
 
-def _correlations(covariances: Array) -> dict[str, Array]:
-    """The correlations of positions."""
-    pairs = {"rho_xy": (0, 1), "rho_xz": (0, 2), "rho_yz": (1, 2)}
-    sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    return {name: covariances[:, i, j] / (sigmas[:, i] * sigmas[:, j]) for name, (i, j) in pairs.items()}
-
-
 def _write_motion(path: Path, motion: Motion) -> None:
     """The cameras of all pictures of shots: `frame,t,camera,focal,rx,ry,rz,tx,ty,tz,k1` and sigmas (px, rad, m)."""
     with TableWriter(path) as table:
@@ -125,5 +118,5 @@ def event_columns(events: Sequence[Event]) -> dict[str, Any]:
 
 
 def state_columns(estimate: Estimate) -> dict[str, Any]:
-    """The columns of states.csv: along a ray of the one camera the place is less sure than across it."""
-    return {KEY: estimate.name, **estimate.columns, **_correlations(estimate.covariances)}
+    """The columns of states.csv."""
+    return {KEY: estimate.name, **estimate.columns, **estimate.correlations}

@@ -7,6 +7,7 @@ from typing import Final
 import cv2
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ballfg.arrays import Array, Index
@@ -28,7 +29,7 @@ BLANK: Final = 60  # grey of a view that was not filmed
 INCH, WIDER = 3.1, 1.2  # inches, width of a view; width of a plot in views
 PROPORTION: Final = 1.45  # least width of a plot over its height
 BESIDE: Final = 0.15  # m shown around the points
-TABLE: Final = "#2a7f4f"  # colour of the table
+TABLE, BOUNCE = "#2a7f4f", "#cc3311"  # colours of the table and of bounces
 
 
 class View:
@@ -132,7 +133,7 @@ class ContactSheet:
         which = f"{count} track{'s' * (count != 1)}" if rows == count else f"{rows} of {count} tracks"
         figure.suptitle(
             f"{which}: the ball in up to {EXPOSURES} frames of each camera, with the points' trail and the sightings. "
-            "Right: points ± 1 sigma from the side and from above.",
+            "Right: points with ellipses of 1 sigma from the side and from above; crosses: bounces.",
             size=10,
             wrap=True,
         )
@@ -156,12 +157,14 @@ class ContactSheet:
         panels[0].plot(table[:2], [self._height] * 2, color=TABLE, linewidth=2.5, zorder=1)
         panels[1].fill(np.array(table)[[0, 1, 1, 0]], np.array(table)[[2, 2, 3, 3]], color=TABLE, alpha=0.35, lw=0)
         panels[0].set_title(f"from the side: {ball.times[0]:.3f} to {ball.times[-1]:.3f} s", size=8)
-        panels[1].set_title(f"from above: {len(ball.times)} points", size=8)
-        sigmas = np.sqrt(np.diagonal(ball.covariances, axis1=1, axis2=2))
+        bounces = self._tracking.bounces.get(self._tracking.names[track], np.zeros((0, 6)))
+        where = "; ".join(f"({x:.2f} ± {sx:.2f}, {y:.2f} ± {sy:.2f}) m" for x, y, _, sx, sy, _ in bounces.tolist())
+        panels[1].set_title(f"from above: {f'bounce at {where}' if where else f'{len(ball.times)} points'}", size=8)
         for panel, up in zip(panels, (2, 1), strict=True):
-            x, y = ball.points[:, 0], ball.points[:, up]
-            panel.errorbar(x, y, sigmas[:, up], sigmas[:, 0], fmt="none", ecolor="#777777", elinewidth=0.6)
-            panel.plot(x, y, "o-", color=hexadecimal(track), markersize=2.6, linewidth=0.6)
+            view = [0, up]
+            _ellipses(panel, ball.points[:, view], ball.covariances[:, view][:, :, view])
+            panel.plot(*ball.points[:, view].T, "o-", color=hexadecimal(track), markersize=2.6, linewidth=0.6)
+            panel.plot(*bounces[:, view].T, "x", color=BOUNCE, markersize=7, markeredgewidth=1.6, zorder=4)
             middle, half = (low[up] + high[up]) / 2, max(high[up] - low[up], (high[0] - low[0]) / PROPORTION) / 2
             panel.set(xlim=(low[0], high[0]), ylim=(middle - half, middle + half), aspect="equal")
             panel.set_ylabel(f"{'xyz'[up]}, m", size=8)
@@ -181,6 +184,15 @@ class ContactSheet:
             panel.set_title(f"{seen.camera}: best scores {scores}", size=8)
         figure.suptitle("no ball: candidates of all frames, the brighter the likelier", size=10)
         return figure
+
+
+def _ellipses(panel: Axes, points: Array, covariances: Array) -> None:
+    """Draws ellipses of one standard deviation, of covariances (n, 2, 2) m^2, about points (n, 2) m."""
+    variances, axes = np.linalg.eigh(covariances)
+    short, long = (2.0 * np.sqrt(np.maximum(variances, 0.0))).T
+    angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
+    own = {"units": "xy", "offsets": points, "offset_transform": panel.transData}
+    panel.add_collection(EllipseCollection(long, short, angles, **own, facecolor="none", edgecolor="#777777", lw=0.6))
 
 
 def _spread(count: int, most: int) -> Index:

@@ -95,7 +95,7 @@ def write_tracking(
         sheet = ContactSheet(tracking, info.table_height, table)
         passing = [sheet.passing(camera, opened()) for camera, opened in enumerate(streams or ())]
         if passing and overlay:
-            write_overlay(stage / OVERLAY, tracking, passing, watch)
+            write_overlay(stage / OVERLAY, tracking, passing, watch, info.table_height)
         for camera, frames in enumerate(passing if not overlay else ()):
             for _ in itertools.islice(frames, sheet.last(camera) + 1):
                 pass

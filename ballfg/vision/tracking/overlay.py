@@ -1,6 +1,8 @@
 """Draws the overlay video: all views side by side with candidates, balls, trails and names.
 
 The cameras are played back on one clock: each shows its frame that is nearest to the time. `ViewPainter` draws a view.
+What a single camera saw has its distance written beside it, and its place on the table below it drawn as an ellipse, in
+which the error of that distance shows.
 """
 
 from collections.abc import Iterator, Sequence
@@ -32,6 +34,8 @@ RING: Final = 9.0  # px, radius of the ring round an associated ball on the scal
 BESIDE: Final = (12.0, -8.0)  # px from the ball to its name
 CANDIDATE: Final = 4.5  # px, radius of the ring round a candidate
 UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)  # colours of candidates of score 0 and 1, mixed between
+NINETY: Final = (-2.0 * np.log(0.1)) ** 0.5  # standard deviations of an ellipse that holds 90 % of a place on a plane
+TURN: Final = np.linspace(0.0, 2.0 * np.pi, 33)  # rad, along such an ellipse
 DIMMED: Final = 0.4  # share of the view's brightness that remains behind text
 CAPTION: Final = 22  # px, height of the line of text at the top
 _SHIFT: Final = 4  # binary digits after the point that OpenCV draws with: a 16th of a pixel
@@ -46,16 +50,20 @@ class Schedule:
 
 
 def write_overlay(
-    path: Path, tracking: Tracking, streams: Sequence[Iterator[tuple[float, Image]]], watch: Watch = unwatched
+    path: Path,
+    tracking: Tracking,
+    streams: Sequence[Iterator[tuple[float, Image]]],
+    watch: Watch = unwatched,
+    table: float | None = None,
 ) -> int:
     """Writes the overlay video (mp4).
 
     Args: path: a new file; its folder exists.  streams: the frames of each camera once more, from the first on.
-        watch: sees the frames that are drawn.
+        watch: sees the frames that are drawn.  table: m, height of its surface; None without one.
     Returns: the number of its frames.
     Raises: OSError: the video cannot be written.
     """
-    painter = OverlayPainter(tracking)
+    painter = OverlayPainter(tracking, table)
     moments = schedule(tracking.detections, tracking.cameras)
     video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), PLAYED_AT, painter.size)
     if not video.isOpened():
@@ -71,8 +79,8 @@ def write_overlay(
 class OverlayPainter:
     """Lays the views out and draws them. Attributes: size: width and height of the overlay, px."""
 
-    def __init__(self, tracking: Tracking) -> None:
-        self._views = [ViewPainter(tracking, i, VIEW_WIDTH) for i in range(len(tracking.cameras))]
+    def __init__(self, tracking: Tracking, table: float | None = None) -> None:
+        self._views = [ViewPainter(tracking, i, VIEW_WIDTH, table) for i in range(len(tracking.cameras))]
         columns, height = min(IN_A_ROW, len(self._views)), max(view.size[1] for view in self._views)
         self._corners = [(i // columns * height, i % columns * VIEW_WIDTH) for i in range(len(self._views))]
         whole = self._corners[-1][0] + height
@@ -123,12 +131,13 @@ def play(moments: Schedule, streams: Sequence[Iterator[tuple[float, Image]]]) ->
 class ViewPainter:
     """Draws the frames of one camera, by its number, at a width in px; the height follows."""
 
-    def __init__(self, tracking: Tracking, camera: int, width: int) -> None:
+    def __init__(self, tracking: Tracking, camera: int, width: int, table: float | None = None) -> None:
         self._camera, self._detections = tracking.cameras[camera], tracking.detections[camera]
         self._names, self._balls = tracking.names, tracking.balls
         self._scale = width / self._camera.size[0]
         self.size = (width, max(1, round(self._camera.size[1] * self._scale)))
         self._trails = [self._camera.project(ball.points) for ball in tracking.balls]
+        self._alone, self._table = len(tracking.cameras) == 1, table
         self._used: dict[int, list[tuple[int, Array]]] = {}
         for track, ball in enumerate(tracking.balls):
             seen = tracking.seen(ball, camera)
@@ -152,12 +161,39 @@ class ViewPainter:
         for pixel, score in zip(candidates.pixels, candidates.scores, strict=True):
             if not any(np.array_equal(pixel, ball) for _, ball in used):
                 ring(view, self._scaled(pixel), CANDIDATE, by_score(score))
+        for track, _ in used if self._alone else ():
+            self._draw_below(view, track, time)
         for track, pixel in used:
             uncover(view, clean, self._scaled(pixel), RING)
             ring(view, self._scaled(pixel), RING, bgr(track), 2)
-            write(view, self._names[track], self._scaled(pixel) + np.array(BESIDE), bgr(track))
+            words = f"{self._names[track]}{self._depth(track, time) if self._alone else ''}"
+            write(view, words, self._scaled(pixel) + np.array(BESIDE), bgr(track))
         caption(view, f"{self._camera.name}   frame {frame}   stamp {self._detections.frames[frame]:.4f} s")
         return view
+
+    def _depth(self, track: int, time: float) -> str:
+        """How far away from the camera a ball is at a time, s, with the standard deviation: no picture shows it."""
+        point, covariance = self._at(track, time)
+        away = point - self._camera.centre
+        far = float(np.linalg.norm(away))
+        sigma = float(np.sqrt(away @ covariance @ away)) / far
+        return f"  {far:.2f} +- {sigma:.2f} m"
+
+    def _draw_below(self, view: Image, track: int, time: float) -> None:
+        """Draws the place on the table below a ball as an ellipse that holds 90 %, and a line to it."""
+        if self._table is None:
+            return
+        point, covariance = self._at(track, time)
+        foot = np.append(point[:2], self._table)
+        around = NINETY * np.linalg.cholesky(covariance[:2, :2]) @ np.stack((np.cos(TURN), np.sin(TURN)))
+        for places in (np.stack((point, foot)), foot + np.column_stack((around.T, np.zeros(len(TURN))))):
+            polyline(view, self._scaled(self._camera.project(places)), bgr(track))
+
+    def _at(self, track: int, time: float) -> tuple[Array, Array]:
+        """Place (3,) m of a ball at a time, s, and its covariance (3, 3) m^2."""
+        ball = self._balls[track]
+        row = int(nearest(ball.times, np.array([time]))[0])
+        return ball.points[row], ball.covariances[row]
 
     def _scaled(self, pixels: Array) -> Array:
         """Places on the drawn view of places in the image: both count from the centre of the top left pixel."""

@@ -1,7 +1,7 @@
 """Turns the videos of a rig into balls: detections, tracks, the agreement of the cameras, and a summary."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -39,6 +39,8 @@ class Tracking:
     detections: tuple[Detections, ...]  # all candidates of each camera, in the order of `cameras`
     balls: tuple[SeenBall, ...]  # in the order of their first points
     agreement: Agreement | None  # the agreement of the cameras; None without a ball
+    bounces: Mapping[str, Array] = field(default_factory=dict)
+    """Of each track that bounces: (k, 6) m, places of the ball's centre and their standard deviations."""
 
     @property
     def names(self) -> list[str]:

@@ -1,17 +1,18 @@
 """The judge of rendered rallies, on a rally that is known, and the rows of given scores."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.cameras.films import film
+from ballfg.benchmarks.cameras.films import Filmed, film, pictures
 from ballfg.benchmarks.cameras.rallies import Score, add_rally, camera_judged, judged
 from ballfg.benchmarks.results import Results
 from ballfg.estimation.rally.events import events_in_play
 from ballfg.estimation.rally.reconstruct import reconstruct
-from ballfg.estimation.rally.video import Rally
+from ballfg.state import POSITION
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.detection.video import open_video
 from tests.estimation.rally.planted import MODEL, POSE_SIGMAS, RATE, SURFACES, planted
@@ -20,8 +21,8 @@ from tests.estimation.rally.planted import MODEL, POSE_SIGMAS, RATE, SURFACES, p
 def test_strokes_of_a_known_rally_are_found_and_those_of_another_are_false() -> None:
     of, motion, found = planted("side", 21)
     one = reconstruct(found, motion.shots[0], MODEL, SURFACES)
-    rally = Rally(motion, (one,), tuple(events_in_play(one, MODEL, SURFACES, 1.0 / RATE, 0.1525)), ())
-    score = judged(rally, of)
+    events = events_in_play(one, MODEL, SURFACES, 1.0 / RATE, 0.1525)
+    score = judged(one.estimates, events, of)
     assert (score.found, score.false) == (len(one.estimates), 0)
     assert max(score.errors) < 0.3
     assert score.bounces[0] == score.found
@@ -29,7 +30,7 @@ def test_strokes_of_a_known_rally_are_found_and_those_of_another_are_false() -> 
     right, asked, sure, known = score.spins
     assert sure <= min(right, known) <= asked
     other, *_ = planted("behind", 4)
-    wrong = judged(rally, other)
+    wrong = judged(one.estimates, events, other)
     assert wrong.found + wrong.false == len(one.estimates)
     assert wrong.false > 0
 
@@ -74,3 +75,26 @@ def test_a_film_has_a_picture_for_each_camera(tmp_path: Path) -> None:
     of, *_ = planted("near", 3)
     film(replace(of, cameras=of.cameras[:6]), tmp_path / "rally.mp4", RATE, 3)
     assert open_video(tmp_path / "rally.mp4").count == 6
+
+
+def test_a_minute_before_a_camera_that_stands_has_pauses_and_a_ball_that_is_hidden_at_times() -> None:
+    of = Filmed(3, 10.0, stands=True).truth
+    assert all(one is of.cameras[0] for one in of.cameras)
+    assert len(of.cameras) == 600
+    gaps = np.array([after.begin - one.end for one, after in pairwise(of.strokes)])
+    assert ((gaps == 0.0) | ((gaps > 1.5) & (gaps < 3.0))).all()
+    assert (gaps == 0.0).any()
+    assert (gaps > 0.0).any()
+    assert of.strokes[-1].end < 60.0
+    assert 0.08 < len(of.hidden) / len(of.cameras) < 0.25  # of 600 pictures bursts hide more than of 3,000
+
+    def ball(hidden: frozenset[int]) -> float:
+        """Grey levels by which the ball brightens a picture in which it is 4 m away."""
+        number = next(k for k in range(600) if of.at(k / 10.0) is not None)
+        one = replace(of, cameras=of.cameras[: number + 1], hidden=hidden, light=1.0, quality=100)
+        (u, v) = of.cameras[0].project(of.at(number / 10.0)[POSITION])
+        *_, last = pictures(one, 10.0, 3)
+        return float(last[int(v) - 1 : int(v) + 2, int(u) - 1 : int(u) + 2].max())
+
+    every = frozenset(range(600))
+    assert ball(frozenset()) > ball(every) + 50.0
