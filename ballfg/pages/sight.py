@@ -1,11 +1,13 @@
 """Finds the rays along which cameras saw the ball of a shot, for drawing."""
 
 from dataclasses import dataclass
+from typing import Protocol, cast
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.tracks import Track
+from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
 
 LEAST_ACROSS = 0.1
@@ -49,7 +51,7 @@ class Sight:
         ends, unknown = self.nearest(places), np.full(places.shape, np.nan)
         positions, sigmas = unknown, unknown.copy()
         positions[self.sample] = ends
-        across = np.sqrt(1.0 - self.rays**2)
+        across = np.sqrt(np.maximum(1.0 - self.rays**2, 0.0))
         across[across < LEAST_ACROSS] = np.nan
         distances = np.linalg.norm(ends - self.centres, axis=1)
         sigmas[self.sample] = (distances * self.noise)[:, None] * across
@@ -63,14 +65,19 @@ def near_picture(camera: Camera) -> Array:
     return np.asarray(camera.centre + NEAR_PICTURE * corners / (corners @ camera.rotation[2])[:, None])
 
 
+class Seen(Protocol):
+    """Observations of a track that are sightings: those of `ballfg.estimation`, which is not needed to draw them."""
+
+    sightings: Sightings
+    cameras: tuple[Camera, ...]
+    state: Index
+    one_view: bool
+
+
 def sight(track: Track) -> Sight:
-    """The sightings of a track that has some.
-
-    Raises: ValueError: it has none.
-    """
-    from ballfg.estimation.observations.sightings import sightings_of  # loads torch, which other pages do not need
-
-    found = sightings_of(track)
+    """The sightings of a track whose positions were made from them."""
+    own = [one for one in track.observations if isinstance(getattr(one, "sightings", None), Sightings)]
+    found = cast(Seen, own[0])
     seen, cameras = found.sightings, found.cameras
     centres = np.stack([camera.centre for camera in cameras])[seen.camera]
     if seen.shifts is not None:

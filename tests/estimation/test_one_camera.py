@@ -98,6 +98,25 @@ def test_what_does_not_fall_is_no_ball(ball: World) -> None:
     assert track_one_camera(empty, SIDE, ball.model, ball.surfaces).estimates == ()
 
 
+def test_a_shoe_that_sways_is_no_ball(ball: World) -> None:
+    """It moves as smoothly as a ball, and a ball near the camera, which lift carries, might move so; none falls so."""
+    times, states = rally(ball)
+    found, rng = seen(times, states, 6), np.random.default_rng(6)
+    t = found.frames - 100.0
+    place = np.stack(
+        [np.full_like(t, 2.3), 0.35 * np.sin(2.0 * t) + 0.1 * np.sin(7.0 * t), np.full_like(t, 0.05)], axis=1
+    )
+    shoe = SIDE.project(place) + NOISE * rng.standard_normal((len(t), 2))
+    parts = [found.in_frame(number) for number in range(len(t))]
+    both = [
+        (frame, Candidates.at(np.vstack((one.pixels, pixel)), NOISE, [*one.scores, 0.8]))
+        for frame, one, pixel in zip(found.frames.tolist(), parts, shoe, strict=True)
+    ]
+    strokes = track_one_camera(Detections.of_frames("side", both), SIDE, ball.model, ball.surfaces)
+    assert len(strokes.estimates) == 3
+    assert max(judged(strokes, times, states)) < 0.08
+
+
 def test_a_light_without_streaks_does_not_hide_those_of_the_ball(ball: World) -> None:
     """The share of the time for which the shutter is open is that of the ball's streaks."""
     times, states = rally(ball)

@@ -1,21 +1,15 @@
-"""Chooses the strokes of a rally: hypotheses from the likeliest arcs, and their best sequence, joined at hits.
-
-The score of a sequence is the logarithm of its probability against clutter alone. Sums over all sequences (forward and
-backward, as for a hidden Markov model) give the probability of each stroke.
-"""
+"""Chooses the strokes of a rally: hypotheses from the likeliest arcs, their best sequence, and what improves it."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
-from ballfg.estimation.rally.arcs import telling
+from ballfg.arrays import Index
 from ballfg.estimation.rally.hits import Hits
+from ballfg.estimation.rally.sequence import BEGINS, MOST_BOUNCES, Chosen, best_sequence, shown_to_fall
 from ballfg.estimation.rally.strokes import Grower, Stroke
 from ballfg.parallel.parts import in_parts
 from ballfg.progress import Watch, unwatched
@@ -24,16 +18,6 @@ KEPT: Final = 15
 """Arcs with the highest scores in each picture, of which strokes are grown."""
 COMPARED: Final = 40
 """Strokes with the highest scores in each picture, of which sequences are made."""
-BEGINS: Final = 8.0
-"""Logarithm of what a stroke costs that no hit joins to the one before."""
-MOST_BOUNCES: Final = 2
-"""Of a stroke: a service has two."""
-SERVED, PAUSE = 20.0, 0.5
-"""Logarithm of what a second bounce costs so many s or less after another stroke: a service begins a rally. From behind
-a player a hit at the far end may look like a bounce."""
-VOLLEY: Final = 5.0
-"""Logarithm of what it costs that a ball is hit which did not bounce before: rules forbid it, and of a bounce right
-before a hit nothing may be seen."""
 GAINED: Final = 0.1
 """Least gain of an exchange."""
 EXCHANGED: Final = 4
@@ -45,18 +29,6 @@ BESIDE: Final = 30
 those that may go on from it."""
 ROUNDS: Final = 6
 """Of exchanges in a sequence, until nothing improves."""
-
-
-@dataclass(frozen=True, eq=False)
-class Chosen:
-    """The strokes of the best sequence, and whether a hit joins each to the one before.
-
-    Attributes: probabilities: of each stroke and those like it, with as many bounces and most of its candidates.
-    """
-
-    strokes: tuple[Stroke, ...]
-    probabilities: Array
-    joined: tuple[bool, ...]
 
 
 def promising(grower: Grower, flights: Sequence[Stroke]) -> list[Stroke]:
@@ -120,7 +92,7 @@ def with_others(grower: Grower, chosen: Chosen, strokes: Sequence[Stroke]) -> Ch
     for one in sorted(strokes, key=lambda stroke: -stroke.score):
         rivals = {holder[row] for row in one.rows.tolist() if row in holder}
         gain = one.score - BEGINS - sum(kept[number].score for number in rivals)
-        if gain > GAINED and _shown(grower, one):
+        if gain > GAINED and shown_to_fall(grower, one):
             number = len(chosen.strokes) + len(chances)
             for rival in rivals:
                 for row in kept.pop(rival).rows.tolist():
@@ -129,13 +101,6 @@ def with_others(grower: Grower, chosen: Chosen, strokes: Sequence[Stroke]) -> Ch
             holder.update((row, number) for row in one.rows.tolist())
     joined = [number < len(chosen.joined) and chosen.joined[number] and number - 1 in kept for number in kept]
     return Chosen(tuple(kept.values()), np.array([chances[number] for number in kept]), tuple(joined))
-
-
-def _shown(grower: Grower, stroke: Stroke) -> bool:
-    """True if a stroke without a hit is a ball's: it bounces or, where any flight counts, shows how it falls."""
-    field = grower.field
-    first, last = field.stamps[field.frame[stroke.rows[[0, -1]]]]
-    return stroke.path.bounces > 0 or (not field.play and last - first >= telling(field))
 
 
 def _open_ends(chosen: Chosen) -> list[tuple[Stroke, int]]:
@@ -213,49 +178,3 @@ def _best_in_each(
             kept.append(stroke)
             taken[first : last + 1] += 1
     return kept
-
-
-def best_sequence(grower: Grower, hits: Hits, strokes: Sequence[Stroke]) -> Chosen:
-    """The likeliest sequence of strokes that follow each other."""
-    ordered = sorted(strokes, key=lambda one: int(grower.field.frame[one.rows[-1]]))
-    count = len(ordered)
-    if not count:
-        return Chosen((), np.zeros(0), ())
-    first, last = (grower.field.frame[[one.rows[end] for one in ordered]] for end in (0, -1))
-    score = np.array([one.score for one in ordered])
-    begins = np.where([_shown(grower, one) for one in ordered], -BEGINS, -np.inf)  # else it may be anything
-    later = first > last[:, None]
-    soon = grower.field.stamps[first] - grower.field.stamps[last][:, None] < PAUSE
-    # without a hit between them a ball in play was there unseen, or a new rally began at once
-    unseen = np.minimum(-np.log(1.0 - grower.field.seen) * (first - last[:, None] - 1), SERVED)
-    alone = np.where(later, begins - np.where(soon, unseen, 0.0), -np.inf)
-    bounces = np.array([one.path.bounces for one in ordered])
-    met = np.where(later, hits.between(ordered, ordered) - VOLLEY * (bounces == 0)[:, None], -np.inf)
-    served = SERVED * (soon & (bounces == MOST_BOUNCES) & (bounces > 0)[:, None])  # a toss before it is no stroke
-    link = np.maximum(alone, met) - served
-    best, before = score + begins, np.full(count, -1)
-    forward, backward = score + begins, np.zeros(count)
-    for j in range(count):
-        ways = best[:j] + link[:j, j]
-        if j and ways.max() > begins[j]:
-            before[j] = int(np.argmax(ways))
-            best[j] = ways.max() + score[j]
-        forward[j] = score[j] + np.logaddexp.reduce(np.append(forward[:j] + link[:j, j], begins[j]))
-    for i in range(count - 1, -1, -1):
-        backward[i] = np.logaddexp.reduce(np.append(link[i] + score + backward, 0.0))
-    total = np.logaddexp.reduce(np.append(forward, 0.0))
-    chain, at = list[int](), int(np.argmax(best))
-    while best.max() > 0.0 and at >= 0:
-        chain.append(at)
-        at = int(before[at])
-    chain.reverse()
-    likely, sets = np.exp(forward + backward - total), [frozenset(one.rows.tolist()) for one in ordered]
-
-    def alike(i: int, j: int) -> bool:
-        shared = 2 * len(sets[i] & sets[j])
-        return shared > len(sets[i]) and shared > len(sets[j]) and bounces[i] == bounces[j]
-
-    # no sequence holds two strokes that are like a third one: their probabilities add up
-    probabilities = np.array([likely[[j for j in range(count) if alike(i, j)]].sum() for i in chain])
-    joined = (False, *(bool(met[i, j] > alone[i, j]) for i, j in pairwise(chain)))[: len(chain)]
-    return Chosen(tuple(ordered[i] for i in chain), np.minimum(probabilities, 1.0), joined)

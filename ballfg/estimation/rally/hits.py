@@ -1,5 +1,6 @@
 """Rates the hits that may join two strokes, by how near their paths come between them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -7,6 +8,8 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import FIVE, FOUR, INDEX, NOTHING, ONE
 from ballfg.estimation.rally.strokes import Grower, Stroke
 
 HIT: Final = 3.0
@@ -45,35 +48,37 @@ class Hits:
 
         Args: strokes, later: n and m; a stroke that begins before another one ends does not follow it.
         """
-        frame = self.grower.field.frame
-        first, last = frame[[one.rows[0] for one in later]], frame[[one.rows[-1] for one in strokes]]
-        gap = first - last[:, None]
-        before, after = np.nonzero((gap > 0) & (gap <= self._widest()))
-        found = np.full(gap.shape, -np.inf)
-        if not len(before):
+        before, after = np.divmod(np.arange(len(strokes) * len(later)), len(later))
+        return self.pairs(strokes, later, before, after).reshape(len(strokes), len(later))
+
+    def pairs(self, strokes: Sequence[Stroke], later: Sequence[Stroke], before: Index, after: Index) -> Array:
+        """(k,) the same of pairs of a stroke and a later one, by their numbers (k,)."""
+        field, found = self.grower.field, np.full(len(before), -np.inf)
+        first, last = field.frame[[one.rows[0] for one in later]], field.frame[[one.rows[-1] for one in strokes]]
+        gap = first[after] - last[before]
+        (near,) = np.nonzero((gap > 0) & (gap <= self._widest()))
+        if not len(near):
             return found
-        ways = [np.array([one.path.vectors[0, one.path.bounces + 1, 0] for one in strokes])[before]]
-        ways += [np.array([one.path.vectors[0, 1, 0] for one in later])[after]]
-        onward = ways[0] * ways[1] > 0.0
-        pair = gap[before, after] - 1
-        starts, spread = self._all_ahead(strokes, 1, before, pair)
-        ends, wider = self._all_ahead(later, -1, after, pair)
-        near = _log_normal(ends - starts, spread + wider + HIT_SIGMA**2 * np.eye(3)).max(axis=1)
-        seen, step = self.grower.field.seen, self.grower.field.step
-        missed = -np.log(1.0 - seen * -np.expm1(-step / HIDDEN)) * pair  # hidden still, or not among the candidates
-        found[before, after] = near + np.log(ROOM) - HIT - SAME_WAY * onward - missed
+        ways = [np.array([one.path.vectors[0, one.path.bounces + 1, 0] for one in strokes])[before[near]]]
+        ways += [np.array([one.path.vectors[0, 1, 0] for one in later])[after[near]]]
+        onward, pair, density = ways[0] * ways[1] > 0.0, gap[near] - 1, np.empty(len(near))
+        ends = self._all_ahead(strokes, 1, before[near]), self._all_ahead(later, -1, after[near])
+        (places, spread, one), (others, wider, other) = ends
+        _nearest(places, spread, others, wider, np.stack((one, other, pair), axis=1), density)
+        missed = -np.log(1.0 - field.seen * -np.expm1(-field.step / HIDDEN)) * pair  # or hidden still
+        found[near] = density + np.log(ROOM) - HIT - SAME_WAY * onward - missed
         return found
 
     def _widest(self) -> int:
         """Pictures between two strokes that a hit joins."""
         return max(1, int(np.ceil(LONGEST_HIT / self.grower.field.step)) - 1)
 
-    def _all_ahead(self, strokes: Sequence[Stroke], way: int, numbers: Index, pair: Index) -> tuple[Array, Array]:
-        """Places (k, m, 3) m and covariances (k, m, 3, 3) of the strokes of some numbers (k,), for their gaps."""
-        used, place = np.unique(numbers, return_inverse=True)
+    def _all_ahead(self, strokes: Sequence[Stroke], way: int, numbers: Index) -> tuple[Array, Array, Index]:
+        """Places (u, g, m, 3) m and covariances (u, g, m, 3, 3) of u strokes, and which has each number (k,)."""
+        used, which = np.unique(numbers, return_inverse=True)
         every = [self._ahead(strokes[number], way) for number in used.tolist()]
         places, covariances = (np.stack([getattr(one, name) for one in every]) for name in ("places", "covariances"))
-        return places[place, pair], covariances[place, pair]
+        return places, covariances, which.astype(np.int64)
 
     def _ahead(self, stroke: Stroke, way: int) -> Ahead:
         """The path after (way 1) or before (-1) a stroke, for each gap that a hit may fill, in order of time."""
@@ -89,9 +94,27 @@ class Hits:
         return self.ends[stroke, way]
 
 
-def _log_normal(off: Array, covariance: Array) -> Array:
-    """(...) logarithm of the normal density at distances (..., 3) with covariances (..., 3, 3)."""
-    root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, off[..., None])[..., 0]
-    size = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
-    return np.asarray(-0.5 * (white**2).sum(axis=-1) - size - 1.5 * np.log(2.0 * np.pi))
+@machine_code(NOTHING(FOUR, FIVE, FOUR, FIVE, INDEX, ONE))
+def _nearest(places, spread, others, wider, pairs, density):
+    """Writes the largest logarithm (k,) of the normal density of what parts two paths, about a hit.
+
+    Args: places, others: (u, g, m, 3) m.  spread, wider: (u, g, m, 3, 3) m^2.  pairs: (k, 3) numbers of both and gap.
+    """
+    root, white = np.zeros((3, 3)), np.zeros(3)
+    for k in range(len(pairs)):
+        one, other, gap = pairs[k]
+        density[k] = -np.inf
+        for m in range(places.shape[2]):
+            value = -1.5 * math.log(2.0 * math.pi)
+            for a in range(3):
+                for b in range(a + 1):
+                    left = spread[one, gap, m, a, b] + wider[other, gap, m, a, b] + (HIT_SIGMA**2 if a == b else 0.0)
+                    for c in range(b):
+                        left -= root[a, c] * root[b, c]
+                    root[a, b] = math.sqrt(left) if a == b else left / root[b, b]
+                white[a] = others[other, gap, m, a] - places[one, gap, m, a]
+                for c in range(a):
+                    white[a] -= root[a, c] * white[c]
+                white[a] /= root[a, a]
+                value -= 0.5 * white[a] * white[a] + math.log(root[a, a])
+            density[k] = max(density[k], value)

@@ -13,10 +13,11 @@ from ballfg.estimation.noise.sightings import Noise, settled
 from ballfg.estimation.observations.rig import with_ends
 from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import arcs
-from ballfg.estimation.rally.choose import Chosen, rally
+from ballfg.estimation.rally.choose import rally
 from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, UNKNOWN, Field, at_court
 from ballfg.estimation.rally.joined import joined_estimates
 from ballfg.estimation.rally.moments import Event
+from ballfg.estimation.rally.sequence import Chosen
 from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of

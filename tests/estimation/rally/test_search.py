@@ -16,9 +16,9 @@ from scipy.stats import multivariate_normal
 from ballfg.benchmarks.cameras.films import Truth
 from ballfg.estimation.rally import hits as hits_of
 from ballfg.estimation.rally.arcs import Foretold
-from ballfg.estimation.rally.choose import BEGINS, MOST_BOUNCES, PAUSE, SERVED, VOLLEY, best_sequence
 from ballfg.estimation.rally.growth import halves, rated
 from ballfg.estimation.rally.hits import Hits
+from ballfg.estimation.rally.sequence import BEGINS, MOST_BOUNCES, PAUSE, SERVED, VOLLEY, best_sequence
 from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
 from ballfg.state import POSITION
 from ballfg.vision.broadcast.motion import Shot
@@ -136,14 +136,14 @@ def test_a_hit_is_as_likely_as_the_normal_density_of_what_parts_the_paths(
     assert Hits(grower).between(strokes[:1], [again])[0, 0] < found[0, 1]
 
 
-class Links:
+class Given:
     """Hits whose likelihoods are given."""
 
     def __init__(self, table: Any) -> None:
         self.table = table
 
-    def between(self, strokes: list[Any], later: list[Any]) -> Any:
-        return self.table[np.ix_([one.number for one in strokes], [one.number for one in later])]
+    def pairs(self, strokes: list[Any], later: list[Any], before: Any, after: Any) -> Any:
+        return self.table[[strokes[i].number for i in before], [later[j].number for j in after]]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -154,7 +154,9 @@ def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed
     last = first + rng.integers(3, 9, count)
     frame, stamps = np.arange(50), 0.04 * np.arange(50)
     grower: Any = SimpleNamespace(field=SimpleNamespace(frame=frame, stamps=stamps, seen=0.6 + 0.05 * seed, play=True))
-    table = rng.normal(0.0, 6.0, (count, count))
+    gap = stamps[first] - stamps[last][:, None]
+    assert hits_of.LONGEST_HIT < PAUSE
+    table = np.where(gap <= hits_of.LONGEST_HIT, rng.normal(0.0, 6.0, (count, count)), -np.inf)
     strokes: list[Any] = [
         SimpleNamespace(
             rows=np.arange(a, b + 1),
@@ -164,7 +166,7 @@ def test_the_best_sequence_and_its_probabilities_are_those_of_all_sequences(seed
         )
         for number, (a, b) in enumerate(zip(first, last, strict=True))
     ]
-    hits: Any = Links(table)
+    hits: Any = Given(table)
     chosen = best_sequence(grower, hits, strokes)
 
     def begins(one: Any) -> float:

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.collections import EllipseCollection
 from numpy.typing import NDArray
 
 from ballfg.tracks.sightings import Sightings
@@ -38,6 +39,8 @@ SIZE = (640, 360)
 RATE = 100.0
 FRAMES = 60
 START, END = 10, 50
+DEPTH = 0.05
+"""m, standard deviation along the ray of a single camera."""
 BACKGROUND, BALL = (60, 90, 70), (240, 250, 245)
 
 
@@ -247,6 +250,50 @@ def test_a_trail_begins_with_its_ball_and_stays_a_moment_after_it() -> None:
     assert (gone == 60).all()
     u, v = RIG[0].project(centre(np.array([0.4])))[0].round().astype(int)
     assert np.abs(after[v - CAPTION - 2 : v - CAPTION + 3, u].astype(int) - 60).max() > 60
+
+
+def alone() -> Tracking:
+    """The recording as one camera saw it: less sure along the ray than across it."""
+    tracking = made()
+    ball = tracking.balls[0]
+    ray = ball.points - RIG[0].centre
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    wide = 1e-6 * np.eye(3) + DEPTH**2 * ray[:, :, None] * ray[:, None, :]
+    seen = replace(ball, covariances=wide, sightings=ball.sightings.select(ball.sightings.camera == 0))
+    bounces = {"000": np.array([[0.1, 0.2, 0.02, 0.03, 0.01, 0.001]])}
+    return replace(tracking, cameras=RIG[:1], detections=tracking.detections[:1], balls=(seen,), bounces=bounces)
+
+
+def test_a_single_camera_draws_the_place_below_the_ball_with_its_error() -> None:
+    """Ninety percent of places lie within an ellipse of 2.146 standard deviations on the table."""
+    tracking, dark = alone(), np.full((SIZE[1], SIZE[0], 3), 60, np.uint8)
+    time, table = 0.3, -0.3
+    plain, marked = (ViewPainter(tracking, 0, SIZE[0], height).paint(dark, 30, time) for height in (None, table))
+    changed = np.argwhere((plain != marked).any(axis=-1))[:, ::-1]
+    ball = tracking.balls[0]
+    row = int(np.argmin(np.abs(ball.times - time)))
+    foot, ray = np.append(ball.points[row, :2], table), ball.points[row] - RIG[0].centre
+    along = np.append(ray[:2], 0.0) / np.linalg.norm(ray)
+    ends = [RIG[0].project(foot + sign * 2.146 * DEPTH * along) for sign in (-1.0, 1.0)]
+    for end in ends:
+        assert np.linalg.norm(changed - end, axis=1).min() < 2.0
+    assert len(changed) > 20
+    middle = RIG[0].project(ball.points[row])
+    far = np.linalg.norm(changed - middle, axis=1).max()
+    assert far < max(np.linalg.norm(end - middle) for end in ends) + 3.0
+
+
+def test_the_sheet_tells_bounces_and_draws_the_covariance_of_each_point() -> None:
+    tracking = alone()
+    _, side, above = sheet_of(tracking, 0).flights().axes
+    assert above.get_title() == "from above: bounce at (0.10 ± 0.03, 0.20 ± 0.01) m"
+    for panel, up in ((side, 2), (above, 1)):
+        (cross,) = [line for line in panel.lines if line.get_marker() == "x"]
+        np.testing.assert_array_equal(np.column_stack(cross.get_data()), tracking.bounces["000"][:, [0, up]])
+        (ellipses,) = [one for one in panel.collections if isinstance(one, EllipseCollection)]
+        variances = np.linalg.eigvalsh(tracking.balls[0].covariances[:, [0, up]][:, :, [0, up]])
+        np.testing.assert_allclose(ellipses.get_widths(), 2.0 * np.sqrt(variances[:, 1]), rtol=1e-9)
+        np.testing.assert_allclose(ellipses.get_heights(), 2.0 * np.sqrt(variances[:, 0]), rtol=1e-6)
 
 
 def test_a_candidate_that_is_no_ball_has_a_ring() -> None:
