@@ -62,6 +62,7 @@ class Found:
         self.models = {self.best.names: self.best}
         self.rounds: list[Round] = []
         self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
+        self.together = MOST_EFFECTS  # number of effects that a round may add
         self.sets: Sets | None = None  # beside something nameless, once that was weighed
 
     @cached_property
@@ -92,9 +93,27 @@ class Found:
         scores = self.scores
         return model is not None and scores[model.names] > scores[(than or self.best).names] + by
 
-    def step(self) -> bool:
-        """One round, or where none adds anything, removes effects without which a refit is better; False: neither."""
-        able = len(self.best.named) < MOST_EFFECTS and len(self.rounds) < MOST_ROUNDS
+    def search(self) -> None:
+        """Adds, removes and exchanges effects as long as that makes the model more probable, then weighs the rest."""
+        begun = len(self.rounds)
+        while self.step(len(self.rounds) - begun):
+            pass
+        self.compare()
+
+    def search_again(self) -> None:
+        """Searches from the declared model on by single effects; the better one of both searches counts."""
+        self.loop.watch("something nameless remains: searching again, one effect at a time")
+        before, self.together = self.best, 1
+        self.best = self.models[frozenset()]
+        self.search()
+        self.best = max(self.best, before, key=lambda model: self.scores[model.names])
+
+    def step(self, made: int) -> bool:
+        """One round, or where none adds anything, removes effects without which a refit is better; False: neither.
+
+        Args: made: number of rounds of this search so far.
+        """
+        able = len(self.best.named) < MOST_EFFECTS and made < MOST_ROUNDS
         return (able and self.round()) or self._pruned(every=True)
 
     def round(self) -> bool:
@@ -104,7 +123,7 @@ class Found:
         def tell(line: str) -> None:
             loop.watch(f"round {number}: {line}")
 
-        most = MOST_EFFECTS - len(best.named)
+        most = min(MOST_EFFECTS - len(best.named), self.together)
         scored, attempts, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, most)
         refits, winner = self._attempted(attempts, tell)
         scored = retested(scored, refits)

@@ -76,9 +76,9 @@ class SearchLoop:
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
         first = first_fit(model, self.holdout) if first is None else first
         found = Found(self, first)
-        while found.step():
-            pass
-        found.compare()
+        found.search()
+        if found.best.nameless:  # a set of effects may have led into a poor minimum
+            found.search_again()
         return self._told(found, first)
 
     def _told(self, found: Found, first: Fit) -> Search:

@@ -92,7 +92,7 @@ def straight(field: Field, found: Sequence[Index]) -> Mask:
         parts = int(since[-1] / longest)
         ends = np.searchsorted(since, np.arange(1, parts) * since[-1] / parts) if parts else ()
         for part in np.split(rows, ends) if parts else ():
-            among[part] |= len(part) >= LEAST and _steady(field, part)
+            among[part] |= len(part) >= LEAST and field.off(part, 1) < NOISE
     return among
 
 
@@ -100,14 +100,6 @@ def _flown(field: Field, found: Sequence[Index]) -> tuple[list[Index], Mask]:
     """The arcs that may be flights, and `straight` of all."""
     clutter = straight(field, found)
     return [rows for rows in found if clutter[rows].mean() < MOSTLY], clutter
-
-
-def _steady(field: Field, rows: Index) -> bool:
-    """True for candidates that differ from a straight and steady motion by noise alone."""
-    since = field.stamps[field.frame[rows]]
-    steady = np.stack((np.ones(len(rows)), since - since.mean()), axis=1)
-    off = field.pixels[rows] - steady @ np.linalg.lstsq(steady, field.pixels[rows], rcond=None)[0]
-    return bool(np.sqrt((off**2).sum(axis=1).mean()) < NOISE)
 
 
 def with_exposure(field: Field, found: Sequence[Index]) -> Field:

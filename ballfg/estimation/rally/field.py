@@ -205,6 +205,13 @@ class Field:
         """True if all bars of an arc lie within so many standard deviations of its motion."""
         return bool((self.bar_off(rows, self.motion(rows)) < most).all())
 
+    def off(self, rows: Index, order: int) -> float:
+        """px, root mean square distance of candidates from the best polynomial of an order in time."""
+        since = self.stamps[self.frame[rows]]
+        powers = np.vander(since - since.mean(), order + 1)
+        off = self.pixels[rows] - powers @ np.linalg.lstsq(powers, self.pixels[rows], rcond=None)[0]
+        return float(np.sqrt((off**2).sum(axis=1).mean()))
+
     def motion(self, rows: Index) -> Array:
         """(n, 2) px a picture, of an arc: the slope of a parabola through each candidate and those beside it."""
         motion = np.empty((len(rows), 2))

@@ -12,7 +12,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.noise.sightings import Noise, settled
 from ballfg.estimation.observations.rig import with_ends
 from ballfg.estimation.observations.sightings import sighted_track
-from ballfg.estimation.rally.arcs import arcs
+from ballfg.estimation.rally.arcs import NOISE, arcs
 from ballfg.estimation.rally.choose import rally
 from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, UNKNOWN, Field, at_court
 from ballfg.estimation.rally.joined import joined_estimates
@@ -156,11 +156,11 @@ def strokes_of(
     if field is None:
         return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
-    if not play:
-        chosen = _balls(smoother, seen, camera, chosen)
+    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field)
     kinked = _kinked(chosen, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), chosen, kinked)
     seen = _with_noise(seen, noise, kinked)
+    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field)  # by the noise that they show
     tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
     alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
     begun, end = _in_play(alone) if play else (0, len(alone))
@@ -207,15 +207,16 @@ def search(
     return chosen, field
 
 
-def _balls(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen) -> Chosen:
-    """The strokes that are a ball's: those that bounce, and those whose fall tells how far away they are.
+def _balls(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen, field: Field) -> Chosen:
+    """The strokes that are a ball's: a bounce shows in the picture, or the fall tells how far away the ball is.
 
     A shoe that sways or a hand that waves moves as smoothly as a ball. What falls like none has no estimate, or one
     whose depth is not known, somewhere before the camera.
     """
-    ball = [bool(stroke.bounces) for stroke in chosen.strokes]
+    ball = [bool(stroke.bounces) and field.off(stroke.rows, 2) > NOISE for stroke in chosen.strokes]
     for number in (number for number, bounces in enumerate(ball) if not bounces):
-        track = _track(chosen.strokes[number], seen, camera, smoother.model, smoother.surfaces)
+        stroke = replace(chosen.strokes[number], bounces=())
+        track = _track(stroke, seen, camera, smoother.model, smoother.surfaces)
         ball[number] = smoother.estimate(track).status is Status.OK
     kept = [number for number, is_ball in enumerate(ball) if is_ball]
     joined = tuple(chosen.joined[number] and ball[number - 1] for number in kept)
