@@ -62,7 +62,7 @@ class Found:
         self.models = {self.best.names: self.best}
         self.rounds: list[Round] = []
         self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
-        self.together = MOST_EFFECTS  # number of effects that a round may add
+        self.begun, self.together = 0, MOST_EFFECTS  # round with which a search began; effects that one may add
         self.sets: Sets | None = None  # beside something nameless, once that was weighed
 
     @cached_property
@@ -95,8 +95,8 @@ class Found:
 
     def search(self) -> None:
         """Adds, removes and exchanges effects as long as that makes the model more probable, then weighs the rest."""
-        begun = len(self.rounds)
-        while self.step(len(self.rounds) - begun):
+        self.begun = len(self.rounds)
+        while self.step():
             pass
         self.compare()
 
@@ -108,12 +108,9 @@ class Found:
         self.search()
         self.best = max(self.best, before, key=lambda model: self.scores[model.names])
 
-    def step(self, made: int) -> bool:
-        """One round, or where none adds anything, removes effects without which a refit is better; False: neither.
-
-        Args: made: number of rounds of this search so far.
-        """
-        able = len(self.best.named) < MOST_EFFECTS and made < MOST_ROUNDS
+    def step(self) -> bool:
+        """One round, or where none adds anything, removes effects without which a refit is better; False: neither."""
+        able = len(self.best.named) < MOST_EFFECTS and len(self.rounds) < self.begun + MOST_ROUNDS
         return (able and self.round()) or self._pruned(every=True)
 
     def round(self) -> bool:

@@ -275,6 +275,27 @@ def test_an_effect_keeps_the_form_about_which_its_strength_is_known(make_ball, m
     assert np.isfinite(alone.cost)
 
 
+def test_where_something_nameless_remains_the_search_begins_again(make_ball, make_launches, make_shots):
+    """By single effects, from the declared model; what the first search missed is found, and the better one counts."""
+    truth = {"frame_tilt": {"x": 0.03, "y": 0.0}, "gust_region": {"x": 2.0, "y": 4.0, "z": 2.0}}
+    data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
+    known, told = [EFFECTS["frame_tilt"]], list[str]()
+    loop = SearchLoop(holdout(*data), known, predicts_well, judges_alike, told.append, of_some=[])
+    found = Found(loop, first_fit(make_ball(), loop.holdout))
+    found.search()
+    astray = found.best
+    assert astray.nameless
+    found.search_again()  # nothing else is in the catalogue
+    assert found.best.names == astray.names
+    assert any("searching again" in line for line in told)
+    found.loop = replace(loop, catalogue=[*known, EFFECTS["gust_region"]])
+    begun = len(found.rounds)
+    found.search_again()
+    assert found.best.names == {"frame_tilt", "gust_region"}
+    assert found.scores[found.best.names] > found.scores[astray.names] + np.log(100.0)
+    assert all(len(one.added) <= 1 for one in found.rounds[begun:])
+
+
 def test_a_model_that_the_last_round_made_shares_its_probability_with_its_neighbours(gusty, gusty_first):
     """A search that ends with as many effects as may be has not looked beyond them."""
     found = Found(gusty, gusty_first)
