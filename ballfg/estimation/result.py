@@ -229,7 +229,7 @@ class Estimate:
 
     @property
     def correlations(self) -> dict[str, Array]:
-        """Further columns where cameras saw the ball, (n,) each: those of x and y, x and z, y and z.
+        """Further columns where cameras saw the ball, (n,) each, dimensionless: those of x and y, x and z, y and z.
 
         Along the ray of a single camera the place is less sure than across it.
         """

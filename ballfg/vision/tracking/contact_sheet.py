@@ -191,8 +191,8 @@ def _ellipses(panel: Axes, points: Array, covariances: Array) -> None:
     variances, axes = np.linalg.eigh(covariances)
     short, long = (2.0 * np.sqrt(np.maximum(variances, 0.0))).T
     angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
-    own = {"units": "xy", "offsets": points, "offset_transform": panel.transData}
-    panel.add_collection(EllipseCollection(long, short, angles, **own, facecolor="none", edgecolor="#777777", lw=0.6))
+    size, where = (long, short, angles), {"offsets": points, "offset_transform": panel.transData}
+    panel.add_collection(EllipseCollection(*size, units="xy", **where, facecolor="none", edgecolor="#777777", lw=0.6))
 
 
 def _spread(count: int, most: int) -> Index:
