@@ -191,8 +191,11 @@ def _ellipses(panel: Axes, points: Array, covariances: Array) -> None:
     variances, axes = np.linalg.eigh(covariances)
     short, long = (2.0 * np.sqrt(np.maximum(variances, 0.0))).T
     angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
-    size, where = (long, short, angles), {"offsets": points, "offset_transform": panel.transData}
-    panel.add_collection(EllipseCollection(*size, units="xy", **where, facecolor="none", edgecolor="#777777", lw=0.6))
+    drawn = EllipseCollection(
+        long, short, angles, units="xy", offsets=points, offset_transform=panel.transData, facecolor="none"
+    )
+    drawn.set(edgecolor="#777777", linewidth=0.6)
+    panel.add_collection(drawn)
 
 
 def _spread(count: int, most: int) -> Index:
