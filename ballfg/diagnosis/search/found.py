@@ -63,7 +63,7 @@ class Found:
         self.rounds: list[Round] = []
         self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
         self.begun, self.together = 0, MOST_EFFECTS  # round with which a search began; effects that one may add
-        self.sets: Sets | None = None  # beside something nameless, once that was weighed
+        self.sets: list[Sets] = []  # beside something nameless, of each search that weighed it
 
     @cached_property
     def patterns(self) -> Patterns:
@@ -214,21 +214,26 @@ class Found:
         loop.watch("weighing sets of effects beside it")
         varying = offered_varying(best, loop.of_some or loop.catalogue, self.ways)
         screen = screen_of(best, self.motion, loop.catalogue, varying, self.patterns)
-        self.sets = Sets.near(screen, MOST_EFFECTS)
-        self.models[best.names] = replace(best, neighbours=self.sets.weights)
+        sets = Sets.near(screen, MOST_EFFECTS)
+        self.sets.append(sets)
+        self.models[best.names] = replace(best, neighbours=sets.weights)
         scores = self.scores
-        self.best = self._model(max((*self.models, *self.sets.members), key=lambda names: scores[names]))
+        self.best = self._model(max((*self.models, *sets.members), key=lambda names: scores[names]))
 
     def _model(self, names: frozenset[str]) -> Weighed:
         """A model weighed before, or that of a set of effects beside something nameless."""
-        if names not in self.models and self.sets is not None:
-            self.models[names] = model_of(self.sets, names, self.first)
+        if names not in self.models:
+            self.models[names] = model_of(self._sets_with(names), names, self.first)
         return self.models[names]
+
+    def _sets_with(self, names: frozenset[str]) -> Sets:
+        """The sets among which one is the most probable; several searches may have come to it."""
+        return max((sets for sets in self.sets if names in sets.members), key=lambda sets: sets.score(names))
 
     def rest(self, gone: Sequence[Hypothesis], model: Weighed) -> Weighed:
         """A model without some of its effects, and without those that need them."""
-        if model.nameless and self.sets is not None:
-            return self._model(self.sets.without(model.names, [h.name for h in gone]))
+        if model.nameless and any(model.names in sets.members for sets in self.sets):
+            return self._model(self._sets_with(model.names).without(model.names, [h.name for h in gone]))
         return self.without(gone, model)
 
     @cached_property

@@ -238,7 +238,8 @@ def test_beside_something_nameless_effects_are_found_from_one_linearisation(gust
     while found.round():
         pass
     found.compare()
-    best, weights = found.best, found.sets.weights
+    (sets,) = found.sets
+    best, weights = found.best, sets.weights
     assert {"frame_tilt", NAMELESS} <= best.names
     assert best.score > weights[frozenset([NAMELESS])].score + np.log(100.0)
     rest = found.rest(best.named, best)
@@ -285,8 +286,10 @@ def test_where_something_nameless_remains_the_search_begins_again(make_ball, mak
     found.search()
     astray = found.best
     assert astray.nameless
-    found.search_again()  # nothing else is in the catalogue
-    assert found.best.names == astray.names
+    found.loop = replace(loop, catalogue=[EFFECTS["restitution_speed"]])
+    found.search_again()  # which knows nothing of what the first one found
+    assert found.best.names == astray.names == {"frame_tilt", NAMELESS}
+    assert found.rest(found.best.named, found.best).names == {NAMELESS}
     assert any("searching again" in line for line in told)
     found.loop = replace(loop, catalogue=[*known, EFFECTS["gust_region"]])
     begun = len(found.rounds)
