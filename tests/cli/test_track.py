@@ -311,6 +311,11 @@ def test_one_camera_gives_states(one_view: Path, tmp_path: Path, capsys: pytest.
     again, sigmas = numbers(states, "t", "x", "y", "z"), numbers(states, "t", "sigma_x", "sigma_y", "sigma_z")
     for name, estimated in found.items():  # each stroke has one bounce, from which both start
         np.testing.assert_array_less(np.abs(again[name] - estimated)[:, 1:], 0.02 * sigmas[name][:, 1:])
+    rho = numbers(states, "t", "rho_xy", "rho_xz", "rho_yz")
+    assert all((np.abs(one[:, 1:]) <= 1.0).all() and np.abs(one[:, 1:]).max() > 0.9 for one in rho.values())  # a ray
+    assert status("show", out, states, "--out", tmp_path / "page.html") == 0
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert '"cameras":[{"name":"right"' in page.replace(" ", "")
 
 
 def at(flown: np.ndarray, times: np.ndarray) -> np.ndarray:
