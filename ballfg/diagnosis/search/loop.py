@@ -77,7 +77,8 @@ class SearchLoop:
         first = first_fit(model, self.holdout) if first is None else first
         found = Found(self, first)
         found.search()
-        if found.best.nameless:  # a set of effects may have led into a poor minimum
+        sets = any(len(made.added) > 1 for made in found.rounds)
+        if found.best.nameless and sets:  # one may have led into a poor minimum
             found.search_again()
         return self._told(found, first)
 
