@@ -238,11 +238,14 @@ def _table(outline: Outline) -> dict[str, Any]:
 def _cameras(shown: Shown) -> list[dict[str, Any]]:
     """Each camera with its place and the corners of its picture."""
     seen = [shot.sight for shot in shown.shots if shot.sight is not None]
-    found = {camera.name: camera for one in seen for camera in one.cameras}.values()
-    places = [(_plain(one.centre, LENGTH_DECIMALS), _plain(near_picture(one), LENGTH_DECIMALS)) for one in found]
+    found = {camera.name: camera for one in seen for camera in one.cameras}
     return [
-        {"name": camera.name, "place": place, "corners": corners}
-        for camera, (place, corners) in zip(found, places, strict=True)
+        {
+            "name": name,
+            "place": _plain(camera.centre, LENGTH_DECIMALS),
+            "corners": _plain(near_picture(camera), LENGTH_DECIMALS),
+        }
+        for name, camera in found.items()
     ]
 
 

@@ -126,8 +126,7 @@ def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
     if given.states is not None:
         rows = _rows(given.states, name, track)
         shot = replace(shot, state_times=rows[:, 0], states=rows[:, 1:10], state_sigmas=rows[:, 10:])
-        which = given.states.rows.get(name, slice(0))
-        own = given.states
+        own, which = given.states, given.states.rows.get(name, slice(0))
         shot = replace(shot, labels=own.labels[which], correlations=own.correlations[which])
     if given.predictions is not None:
         rows = _rows(given.predictions, name, track)
@@ -156,8 +155,8 @@ def _with_noise(given: Given, shots: list[ShownShot]) -> tuple[list[ShownShot], 
     if given.dataset.rough:
         if all(shot.sight is not None and shot.sight.one_view for shot in shots):
             return shots, (
-                "One camera saw the ball: a sample is the point of its ray that is nearest to the estimate, and the "
-                "residuals are those across the rays, of one pixel's noise."
+                "One camera saw the ball: a sample is the point of its ray that is nearest to the estimate. Residuals "
+                "are those across the ray, and their standard deviation is that of the pixel."
             )
         return (
             shots,
