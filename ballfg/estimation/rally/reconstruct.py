@@ -156,11 +156,11 @@ def strokes_of(
     if field is None:
         return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
-    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field)
+    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field, watch)
     kinked = _kinked(chosen, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), chosen, kinked)
     seen = _with_noise(seen, noise, kinked)
-    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field)  # by the noise that they show
+    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field, watch)  # by the noise that they show
     tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
     alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
     begun, end = _in_play(alone) if play else (0, len(alone))
@@ -207,14 +207,15 @@ def search(
     return chosen, field
 
 
-def _balls(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen, field: Field) -> Chosen:
+def _balls(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen, field: Field, watch: Watch) -> Chosen:
     """The strokes that are a ball's: a bounce shows in the picture, or the fall tells how far away the ball is.
 
     A shoe that sways or a hand that waves moves as smoothly as a ball. What falls like none has no estimate, or one
     whose depth is not known, somewhere before the camera.
     """
     ball = [bool(stroke.bounces) and field.off(stroke.rows, 2) > NOISE for stroke in chosen.strokes]
-    for number in (number for number, bounces in enumerate(ball) if not bounces):
+    doubtful = [number for number, bounces in enumerate(ball) if not bounces]
+    for number in watch(doubtful, len(doubtful), "flights without a bounce estimated"):
         stroke = replace(chosen.strokes[number], bounces=())
         track = _track(stroke, seen, camera, smoother.model, smoother.surfaces)
         ball[number] = smoother.estimate(track).status is Status.OK
