@@ -12,6 +12,7 @@ from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, INDEX, NOTH
 from ballfg.estimation.observations.ray_path import NEAREST, ROBUST, ROUNDS
 
 SPEED: Final = 15.0  # m/s, prior standard deviation of each component of a velocity
+SLOWEST: Final = 0.1  # m/s, for which a flight may have lift
 KEPT: Final = 0.8  # Share of the horizontal velocity that a bounce leaves; friction takes or adds some
 FRICTION_SIGMA: Final = 1.0  # m/s, standard deviation about it: the spin is unknown
 RESTITUTION_SIGMA: Final = 0.15  # m/s, of the vertical velocity after a bounce
@@ -44,8 +45,8 @@ NUMBERS: Final = np.dtype(
     ]
 )
 """Ball and place: m/s^2; 1/m; of the normal velocity; m, of the ball's centre at a bounce, at the origin, and by how
-much it rises along x and y; m, mean and standard deviation of the ball's place; m/s^2, standard deviations of the
-acceleration by spin, zero for none."""
+much it rises along x and y; m, mean and standard deviation of the ball's place; 1/s, standard deviations of the
+acceleration by spin for each m/s of speed, zero for none."""
 ONE_RAY: Final[Any] = from_dtype(RAY)
 RAYS: Final[Any] = from_dtype(RAY)[::1]
 SCENE: Final[Any] = from_dtype(NUMBERS)
@@ -128,21 +129,22 @@ def _rule(number, scene, times, bounces, drag, row):
     return target
 
 
-@machine_code(REAL(COUNT, SCENE, COUNT))
-def _sigma(number, scene, bounces):
-    """Prior standard deviation of one of the unknowns (3 c,)."""
+@machine_code(REAL(COUNT, SCENE, COUNT, ONE))
+def _sigma(number, scene, bounces, speed):
+    """Prior standard deviation of one of the unknowns (3 c,) of flights at speeds (b + 1,) m/s."""
     if number < 3:
         return scene.spread
-    return SPEED if number < 3 * (bounces + 2) else scene.lift[number % 3]
+    flight = number // 3 - bounces - 2
+    return SPEED if flight < 0 else scene.lift[number % 3] * max(speed[flight], SLOWEST)
 
 
-@machine_code(NOTHING(SCENE, ONE, COUNT, ONE, TWO, ONE))
-def _prior(scene, times, bounces, drag, information, side):
+@machine_code(NOTHING(SCENE, ONE, COUNT, ONE, ONE, TWO, ONE))
+def _prior(scene, times, bounces, drag, speed, information, side):
     """Writes the information (n, n) and its pull (n,) of the wide priors, and of the plane and laws of each bounce."""
     size, row = len(side), np.empty(len(side))
     information[:], side[:] = 0.0, 0.0
     for i in range(size):
-        information[i, i] = _sigma(i, scene, bounces) ** -2.0
+        information[i, i] = _sigma(i, scene, bounces, speed) ** -2.0
         if i < 3:
             side[i] = scene.centre[i] * information[i, i]
     for number in range(RULES * bounces):
@@ -154,12 +156,12 @@ def _prior(scene, times, bounces, drag, information, side):
                     information[i, j] += row[i] * row[j]
 
 
-@machine_code(REAL(SCENE, ONE, COUNT, ONE, ONE))
-def _off(scene, times, bounces, drag, unknown):
+@machine_code(REAL(SCENE, ONE, COUNT, ONE, ONE, ONE))
+def _off(scene, times, bounces, drag, speed, unknown):
     """Sum of the squares by which unknowns (3 c,) miss their priors, and the laws of the bounces."""
     square, row = 0.0, np.empty(len(unknown))
     for i in range(len(unknown)):
-        square += ((unknown[i] - (scene.centre[i] if i < 3 else 0.0)) / _sigma(i, scene, bounces)) ** 2
+        square += ((unknown[i] - (scene.centre[i] if i < 3 else 0.0)) / _sigma(i, scene, bounces, speed)) ** 2
     for number in range(RULES * bounces):
         left = -_rule(number, scene, times, bounces, drag, row)
         for i in range(len(unknown)):
@@ -260,28 +262,31 @@ def flown(rays, rows, scene, times, bounces, wide):
     size, drag, vectors, shares = 3 * count, np.zeros(bounces + 1), np.empty((count, 3)), np.empty((m, count + 1))
     information, covariance, unknown = np.empty((size, size)), np.empty((size, size)), np.empty(size)
     depth, weight, misfit, known = np.ones(m), np.ones(m), 0.0, 0.0
+    speed = np.full(bounces + 1, SPEED)
     for turn in range(ROUNDS):
         for n in range(m):
             shares[n, count] = share_at(rays[rows[n]].time, times, bounces, drag, scene.gravity, shares[n, :count])
-        _prior(scene, times, bounces, drag, information, unknown)
+        _prior(scene, times, bounces, drag, speed, information, unknown)
         _see(rays, rows, depth, weight, shares, information, unknown)
         known = _root(information)
         _solve(information, unknown, 0)
         vectors[:] = unknown.reshape(count, 3)
         misfit = _miss(rays, rows, shares, vectors, depth, weight)
         if turn == ROUNDS - 1:
-            misfit += _off(scene, times, bounces, drag, unknown)
+            misfit += _off(scene, times, bounces, drag, speed, unknown)
         for flight in range(bounces + 1):
             v = vectors[1 + flight]
-            speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-            drag[flight] = scene.drag * min(speed, 2.0 * SPEED)
+            flown = min(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), 2.0 * SPEED)
+            drag[flight] = scene.drag * flown
+            if turn < ROUNDS - 1:  # the last solution's prior is that of the one before
+                speed[flight] = flown
     if not wide:
         return Flown(misfit, 0.0, vectors, drag, covariance)
     for i in range(size):
         covariance[i] = 0.0
         covariance[i, i] = 1.0
         _solve(information, covariance[i], i)
-    _prior(scene, times, bounces, drag, information, unknown)
+    _prior(scene, times, bounces, drag, speed, information, unknown)
     return Flown(misfit, 0.5 * (_root(information) - known), vectors, drag, covariance)
 
 

@@ -2,7 +2,7 @@
 
 Each sighting gives two equations that are linear in the place of the first bounce and in the velocity of each flight.
 Drag stretches a flight's time s to ln(1 + k v s) / (k v), with the speed v of the last solution, and shortens the fall
-g s^2 / 2 by 1 + k v s / 3. Spin, where a scene has it, accelerates each flight evenly.
+g s^2 / 2 by 1 + k v s / 3. Spin, where a scene has it, accelerates each flight evenly, the more the faster it is.
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from ballfg.state import Z
 
 PLAY: Final = 1.0
 """Half diagonals of a table, prior standard deviation along each axis of the ball's place about its centre."""
-LIFT: Final = (2.0, 6.0, 6.0)
-"""m/s^2, prior standard deviation of the acceleration by spin: 12 m/s and 170 rad/s; it stands across the flight, which
-goes along x."""
+LIFT: Final = (1.0 / 6.0, 0.5, 0.5)
+"""1/s, prior standard deviation of the acceleration by spin for each m/s of speed: 170 rad/s; it stands across the
+flight, which goes along x."""
 ASIDE: Final = 0.1  # m beside the table where a bounce may seem to be
 
 
@@ -36,7 +36,7 @@ class Scene:
     surfaces: Surfaces
     height: float
     lift: tuple[float, float, float] | None = None
-    """m/s^2, prior standard deviations of a flight's constant acceleration by spin; None: no spin."""
+    """1/s, prior standard deviations of a flight's constant acceleration by spin, by its speed; None: no spin."""
 
     @property
     def plane(self) -> float:
