@@ -96,7 +96,7 @@ def read_sightings(
         mine = rows[names[rows] == name]
         own = {column: cells[mine] for column, cells in values.items()}
         pixels = np.column_stack((own["u"], own["v"]))
-        radii = _radii(own) if RADIUS[0] in own else None
+        radii = radii_of(own) if RADIUS[0] in own else None
         streaks = streaks_of(own) if any(one in own for one in STREAK) else None
         cues = (covariances(own), radii, streaks, shifts_of(own))
         found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, *cues)
@@ -214,10 +214,13 @@ def covariances(values: Mapping[str, Array]) -> Array:
     return np.stack((sigma_u**2, across, across, sigma_v**2), axis=-1).reshape(-1, 2, 2)
 
 
-def _radii(values: Mapping[str, Array]) -> Array:
-    """(n, 2) px, the ball's radius in the picture and its sigma."""
-    radius = values[RADIUS[0]]
-    return np.stack((radius, values.get(RADIUS[1], np.full_like(radius, UNSTATED["sigma_u"]))), axis=1)
+def radii_of(values: Mapping[str, Array]) -> Array:
+    """(n, 2) px, the ball's radius in the picture and its sigma; 0 and any sigma where a table has none."""
+    (count,) = {len(column) for column in values.values()}
+    radius, sigma = (
+        values.get(name, np.full(count, value)) for name, value in zip(RADIUS, (0.0, UNSTATED["sigma_u"]), strict=True)
+    )
+    return np.stack((radius, sigma), axis=1)
 
 
 def streaks_of(values: Mapping[str, Array]) -> Array:
@@ -241,18 +244,21 @@ def seen_columns(
     spread: Array,
     ends: Array | None = None,
     shift: Array | None = None,
+    radii: Array | None = None,
 ) -> dict[str, ArrayLike]:
     """The columns of a table from stamps (n,) s, cameras, pixels (n, 2) and covariances (n, 2, 2) px^2.
 
     Args:
         ends: (n, 2, 2) px, of streaks, NaN where there are none; None: without their columns.
         shift: (n, 3) m, where the cameras stood from their places; None: without its columns.
+        radii: (n, 2) px, of the balls in the picture, 0 where unknown, and standard deviations; None: without.
     """
+    sized = {} if radii is None else dict(zip(RADIUS, radii.T, strict=True))
     moved = {} if shift is None else dict(zip(SHIFT, shift.T, strict=True))
     way = {} if ends is None else dict(zip(STREAK, np.nan_to_num(ends[:, 1] - ends[:, 0]).T, strict=True))
     sigma_u, sigma_v = (np.sqrt(spread[:, i, i]) for i in (0, 1))
     noise = {"sigma_u": sigma_u, "sigma_v": sigma_v, "rho_uv": spread[:, 0, 1] / (sigma_u * sigma_v)}
-    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise, **way, **moved}
+    return {"t": times, CAMERA: camera, "u": pixels[:, 0], "v": pixels[:, 1], **noise, **sized, **way, **moved}
 
 
 def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -15,8 +16,8 @@ from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation import Status
 from ballfg.estimation.one_camera import Strokes, track_one_camera
 from ballfg.estimation.rally.arcs import BENT, CARRIED, MOSTLY, arcs, telling
-from ballfg.estimation.rally.field import FLATTEST, Field, at_court
-from ballfg.estimation.rally.reconstruct import search, without_lens
+from ballfg.estimation.rally.field import FLATTEST, Field, at_court, without_lens
+from ballfg.estimation.rally.reconstruct import search
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Candidates, Detections
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
@@ -33,10 +34,10 @@ def ball() -> World:
     return made._replace(surfaces=replace(made.surfaces, extent=(-1.37, 1.37, -0.76, 0.76)))
 
 
-def rally(ball: World) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) s and states (n, 9) of three strokes to and fro, each with a bounce."""
+def rally(ball: World, hits: Sequence[float] = HITS) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) s and states (n, 9) of strokes to and fro, each with a bounce, between hits at times, s."""
     state, times, states = np.array([-1.3, -0.2, TABLE + 0.25, 4.5, 0.2, 0.6, 0.0, 60.0, 0.0]), [], []
-    for number, (start, end) in enumerate(pairwise(HITS)):
+    for number, (start, end) in enumerate(pairwise(hits)):
         stamps = np.arange(np.ceil(start * RATE), np.ceil(end * RATE)) / RATE
         since = torch.from_numpy(np.append(np.append(0.0, stamps - start), end - start))
         with torch.no_grad():
@@ -51,14 +52,14 @@ def rally(ball: World) -> tuple[np.ndarray, np.ndarray]:
 def seen(times: np.ndarray, states: np.ndarray, seed: int, hidden: float = 0.05, camera: Camera = SIDE) -> Detections:
     """The ball in most frames, two wrong candidates in each, and a light that glides through the picture."""
     rng, frames = np.random.default_rng(seed), []
-    first = round(times[0] * RATE)
     pixels = camera.project(states[:, :3]) + NOISE * rng.standard_normal((len(times), 2))
-    for frame in range(first + len(times) + 20):
+    numbers = {round(t * RATE): row for row, t in enumerate(times)}
+    for frame in range(max(numbers) + 21):
         found, scores = [*rng.uniform((0, 0), camera.size, (2, 2))], [0.35, 0.4]
         found.append(np.array([100.0 + 3.0 * frame, 600.0]) + NOISE * rng.standard_normal(2))
         scores.append(0.5)
-        if first <= frame < first + len(times) and rng.uniform() > hidden:
-            found.append(pixels[frame - first])
+        if frame in numbers and rng.uniform() > hidden:
+            found.append(pixels[numbers[frame]])
             scores.append(0.9)
         frames.append((100.0 + frame / RATE, Candidates.at(np.array(found), NOISE, scores)))
     return Detections.of_frames("side", frames)
@@ -98,8 +99,9 @@ def test_what_does_not_fall_is_no_ball(ball: World) -> None:
     assert track_one_camera(empty, SIDE, ball.model, ball.surfaces).estimates == ()
 
 
-def test_a_shoe_that_sways_is_no_ball(ball: World) -> None:
-    """It moves as smoothly as a ball, and a ball near the camera, which lift carries, might move so; none falls so."""
+@pytest.mark.parametrize("sized", [False, True])
+def test_a_shoe_that_sways_is_no_ball(ball: World, sized: bool) -> None:
+    """It moves as smoothly as a ball, and one near the camera that lift carries might move so; three times as large."""
     times, states = rally(ball)
     found, rng = seen(times, states, 6), np.random.default_rng(6)
     t = found.frames - 100.0
@@ -112,9 +114,41 @@ def test_a_shoe_that_sways_is_no_ball(ball: World) -> None:
         (frame, Candidates.at(np.vstack((one.pixels, pixel)), NOISE, [*one.scores, 0.8]))
         for frame, one, pixel in zip(found.frames.tolist(), parts, shoe, strict=True)
     ]
-    strokes = track_one_camera(Detections.of_frames("side", both), SIDE, ball.model, ball.surfaces)
+    seen_both = Detections.of_frames("side", both)
+    if sized:
+        mine, other = (np.isclose(seen_both.scores, score) for score in (0.9, 0.8))
+        radii = np.tile([0.0, 1.0], (len(seen_both), 1))
+        row = np.minimum(np.searchsorted(times, seen_both.times - 100.0 - 1e-6), len(times) - 1)
+        for where, points, large in ((mine, states[row, :3], 1.1), (other, place[seen_both.frame], 3.3)):
+            depth = points[where] @ SIDE.rotation[2] + SIDE.tvec[2]
+            radii[where] = (large * 1000.0 * ball.model.radius / depth)[:, None] * [1.0, 0.02]
+        seen_both = replace(seen_both, radii=radii)
+    strokes = track_one_camera(seen_both, SIDE, ball.model, ball.surfaces)
     assert len(strokes.estimates) == 3
     assert max(judged(strokes, times, states)) < 0.08
+
+
+def test_how_far_away_a_lob_without_a_bounce_was_is_told_by_its_radius(ball: World) -> None:
+    """Radii are all measured a tenth too large, as those of the strokes with a bounce show."""
+    hits = (*HITS, 2.44, 3.06, 3.66)
+    times, states = rally(ball, hits)
+    lob, start = np.arange(4.4, 5.0, 1.0 / RATE), np.array([-0.8, 0.2, TABLE + 0.3, 2.5, 0.1, 3.2, 0.0, 60.0, 0.0])
+    with torch.no_grad():
+        path = rollout(ball.model, torch.from_numpy(start[None]), torch.from_numpy(lob - 4.4), ball.surfaces)[0].numpy()
+    times, states = np.append(times, lob), np.vstack((states, path))
+    found, rng = seen(times, states, 3, hidden=0.0), np.random.default_rng(8)
+    balls = np.flatnonzero(np.isclose(found.scores, 0.9))
+    depth = states[:, :3] @ SIDE.rotation[2] + SIDE.tvec[2]
+    radii, true = np.tile([0.0, 1.0], (len(found), 1)), 1000.0 * ball.model.radius / depth
+    large = 1.1 * np.exp(0.03 * rng.standard_normal(len(balls)))
+    radii[balls] = np.stack((true * large, 0.02 * true), axis=1)
+    for known in (radii, np.zeros((0, 2))):
+        strokes = track_one_camera(replace(found, radii=known), SIDE, ball.model, ball.surfaces)
+        assert len(strokes.estimates) == (7 if len(known) else 6)
+        assert max(judged(strokes, times, states)) < 0.15
+        assert all(one.status is Status.OK for one in strokes.estimates)
+        sized = [one.sightings.radii is not None for one in strokes.tracking.balls]
+        assert sized == [len(known) > 0] * len(sized)
 
 
 def test_a_light_without_streaks_does_not_hide_those_of_the_ball(ball: World) -> None:
@@ -280,7 +314,7 @@ def test_two_balls_may_fly_at_the_same_time(ball: World) -> None:
     order = np.argsort(np.append(both.frame, extra.frame), kind="stable")
     joined: dict[str, Any] = {
         name: np.concatenate((getattr(both, name), getattr(extra, name)))[order]
-        for name in ("frame", "pixels", "covariances", "scores", "streaks")
+        for name in ("frame", "pixels", "covariances", "scores", "streaks", "radii")
     }
     strokes = track_one_camera(replace(both, **joined), SIDE, ball.model, ball.surfaces)
     assert len(strokes.estimates) == 6

@@ -81,7 +81,7 @@ def show(
 
 def _rally(given: list[Path]) -> tuple[Path, Path | None] | None:
     """The folder of a rally and its video, if these are what is given."""
-    from ballfg.estimation.rally.files import VIDEOS, is_rally  # light: most pages are of no rally
+    from ballfg.vision.broadcast.files import VIDEOS, is_rally  # light: most pages are of no rally
 
     videos = [path for path in given if path.suffix.lower() in VIDEOS]
     folders = [path for path in given if path not in videos]

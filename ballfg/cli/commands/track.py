@@ -167,7 +167,6 @@ def _moving_camera(
     """Tracks the ball in one video of a camera that pans and zooms."""
     import numpy as np
 
-    from ballfg.estimation.rally.files import FILES
     from ballfg.estimation.rally.tables import write_rally
     from ballfg.estimation.rally.video import Rally, surfaces_of, track_moving_camera
     from ballfg.files.whole_folder import reserved
@@ -175,6 +174,7 @@ def _moving_camera(
     from ballfg.parallel.parts import with_jobs
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.broadcast.court import TABLE_TENNIS, read_court
+    from ballfg.vision.broadcast.files import FILES
     from ballfg.vision.broadcast.given import read_candidates, read_corners
     from ballfg.vision.detection.video import open_video
     from ballfg.vision.tracking.dataset import check_result_folder

@@ -60,6 +60,23 @@ def at_court(camera: Camera, surfaces: Surfaces) -> tuple[float, float]:
     return focal / distance, focal / distance * across * STANDARD_GRAVITY
 
 
+def without_lens(seen: Detections, camera: Camera) -> tuple[Detections, Camera]:
+    """The candidates as a camera without distortion and with one focal length would see them, and that camera."""
+    (fx, fy), middle = np.diag(camera.matrix)[:2], camera.matrix[:2, 2]
+    if fx == fy and not camera.distortion.any():
+        return seen, camera
+    focal = float(np.sqrt(fx * fy))
+
+    def onto(pixels: Array) -> Array:
+        return focal * camera.normalized(pixels) + middle
+
+    slope = np.stack([onto(seen.pixels + step) - onto(seen.pixels - step) for step in 0.5 * np.eye(2)], axis=-1)
+    spread = slope @ seen.covariances @ slope.swapaxes(1, 2)
+    flat = replace(seen, pixels=onto(seen.pixels), covariances=spread, streaks=onto(seen.streaks))
+    matrix = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
+    return flat, replace(camera, matrix=matrix, distortion=np.zeros(0))
+
+
 @machine_code(several(REAL, 2)(REAL, REAL, REAL, REAL))
 def bar_error(x, y, to_x, to_y):
     """px^2, squared distance of a bar from a motion while the shutter is open, either way around; its variance."""

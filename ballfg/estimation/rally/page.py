@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.rally.files import COURT, EVENTS, MOTION, STATES, STROKES, VIDEOS
 from ballfg.estimation.rally.tables import POSE
 from ballfg.pages.html import Html, items, own, section, tag, whole_page
 from ballfg.state import STANDARD_GRAVITY
@@ -19,6 +18,7 @@ from ballfg.tracks import csv_files
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, read_info
 from ballfg.vision.broadcast.court import TABLE_TENNIS, read_court
+from ballfg.vision.broadcast.files import COURT, EVENTS, MOTION, STATES, STROKES, VIDEOS
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
 

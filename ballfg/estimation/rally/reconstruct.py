@@ -6,32 +6,30 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Mask
+from ballfg.arrays import Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.noise.sightings import Noise, settled
-from ballfg.estimation.observations.rig import with_ends
-from ballfg.estimation.observations.sightings import sighted_track
-from ballfg.estimation.rally.arcs import NOISE, arcs
+from ballfg.estimation.rally.arcs import arcs
 from ballfg.estimation.rally.choose import rally
-from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, UNKNOWN, Field, at_court
+from ballfg.estimation.rally.doubtful import balls, kept_of, shows_bounce
+from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, UNKNOWN, Field, at_court, without_lens
 from ballfg.estimation.rally.joined import joined_estimates
 from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.sequence import Chosen
-from ballfg.estimation.rally.strokes import LEAST, Grower, Stroke
+from ballfg.estimation.rally.strokes import LEAST, Grower, track_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks.sightings import Sightings
-from ballfg.tracks.stamps import elapsed, written
+from ballfg.tracks.stamps import elapsed
 from ballfg.tracks.track import Track
 from ballfg.vision.broadcast.measured import Flow
 from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera import Camera
-from ballfg.vision.detection.detections import Detections
+from ballfg.vision.detection.detections import UNSIZED, Detections
 
 FRAME_SIGMA: Final = 0.3
 """px, of a picture's camera beside the error that all of a shot share."""
@@ -94,23 +92,6 @@ def on_fixed_camera(found: Detections, shot: Shot, onto: Pinhole, name: str) -> 
     return replace(moved, shifts=shot.shifts).select(seen)
 
 
-def without_lens(seen: Detections, camera: Camera) -> tuple[Detections, Camera]:
-    """The candidates as a camera without distortion and with one focal length would see them, and that camera."""
-    (fx, fy), middle = np.diag(camera.matrix)[:2], camera.matrix[:2, 2]
-    if fx == fy and not camera.distortion.any():
-        return seen, camera
-    focal = float(np.sqrt(fx * fy))
-
-    def onto(pixels: Array) -> Array:
-        return focal * camera.normalized(pixels) + middle
-
-    slope = np.stack([onto(seen.pixels + step) - onto(seen.pixels - step) for step in 0.5 * np.eye(2)], axis=-1)
-    spread = slope @ seen.covariances @ slope.swapaxes(1, 2)
-    flat = replace(seen, pixels=onto(seen.pixels), covariances=spread, streaks=onto(seen.streaks))
-    matrix = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
-    return flat, replace(camera, matrix=matrix, distortion=np.zeros(0))
-
-
 def reconstruct(
     found: Detections,
     shot: Shot,
@@ -156,12 +137,15 @@ def strokes_of(
     if field is None:
         return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
-    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field, watch)
-    kinked = _kinked(chosen, field)
-    noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), chosen, kinked)
+    radii, seen = seen.radii, replace(seen, radii=UNSIZED)
+    sure = shows_bounce(chosen, field)
+    telling = chosen if play or not any(sure) else kept_of(chosen, sure)
+    kinked = _kinked(telling, field)
+    noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), telling, kinked)
     seen = _with_noise(seen, noise, kinked)
-    chosen = chosen if play else _balls(smoother, seen, camera, chosen, field, watch)  # by the noise that they show
-    tracks = [_track(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
+    if not play:
+        chosen, seen = balls(smoother, seen, radii, camera, chosen, sure, watch)
+    tracks = [track_of(stroke, seen, camera, model, surfaces) for stroke in chosen.strokes]
     alone = [smoother.estimate(track) for track in watch(tracks, len(tracks), "strokes estimated")]
     begun, end = _in_play(alone) if play else (0, len(alone))
     joined = (False, *chosen.joined[begun + 1 : end])
@@ -207,23 +191,6 @@ def search(
     return chosen, field
 
 
-def _balls(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen, field: Field, watch: Watch) -> Chosen:
-    """The strokes that are a ball's: a bounce shows in the picture, or the fall tells how far away the ball is.
-
-    A shoe that sways or a hand that waves moves as smoothly as a ball. What falls like none has no estimate, or one
-    whose depth is not known, somewhere before the camera.
-    """
-    ball = [bool(stroke.bounces) and field.off(stroke.rows, 2) > NOISE for stroke in chosen.strokes]
-    doubtful = [number for number, bounces in enumerate(ball) if not bounces]
-    for number in watch(doubtful, len(doubtful), "flights without a bounce estimated"):
-        stroke = replace(chosen.strokes[number], bounces=())
-        track = _track(stroke, seen, camera, smoother.model, smoother.surfaces)
-        ball[number] = smoother.estimate(track).status is Status.OK
-    kept = [number for number, is_ball in enumerate(ball) if is_ball]
-    joined = tuple(chosen.joined[number] and ball[number - 1] for number in kept)
-    return Chosen(tuple(chosen.strokes[number] for number in kept), chosen.probabilities[kept], joined)
-
-
 def _kinked(chosen: Chosen, field: Field) -> Mask:
     """(n,) True for the chosen candidates in whose bars the ball bounced."""
     kinked, half = np.zeros(len(field.frame), dtype=bool), 0.5 * field.exposure * field.step
@@ -249,20 +216,9 @@ def _noise(smoother: Smoother, seen: Detections, camera: Camera, chosen: Chosen,
 
     def tracks_of(noises: list[Noise]) -> list[Track]:
         now = _with_noise(seen, noises[0], kinked)
-        return [_track(stroke, now, camera, smoother.model, smoother.surfaces) for stroke in chosen.strokes]
+        return [track_of(stroke, now, camera, smoother.model, smoother.surfaces) for stroke in chosen.strokes]
 
     return settled(smoother, tracks_of, seen.covariances[rows], np.zeros(len(rows), dtype=np.int64), ~kinked[rows])[0]
-
-
-def _track(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, surfaces: Surfaces) -> Track:
-    """A stroke as a track of sightings with known bounces."""
-    rows = stroke.rows
-    parts = np.zeros(len(rows), dtype=np.int64), seen.times[rows], seen.pixels[rows], seen.covariances[rows]
-    bounces = written(stroke.bounces, float(seen.frames[0])) - camera.time_offset
-    way = np.nan_to_num(seen.streaks[rows, 1] - seen.streaks[rows, 0])
-    shifts = None if seen.shifts is None else seen.shifts[seen.frame[rows]]
-    sightings = with_ends(Sightings((camera.name,), *parts, streaks=way, shifts=shifts), [camera])
-    return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)
 
 
 def _in_play(estimates: Sequence[Estimate]) -> tuple[int, int]:

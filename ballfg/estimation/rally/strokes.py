@@ -13,15 +13,22 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, possible, shares_of, solved
 from ballfg.estimation.observations.ray_path import Rays
+from ballfg.estimation.observations.rig import with_ends
+from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.rally.arcs import SLOWEST
 from ballfg.estimation.rally.field import Field, ends_of
 from ballfg.estimation.rally.growth import CANDIDATE, VIEW, all_rated, filled, grown, rated
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.state import Z
+from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.stamps import written
+from ballfg.tracks.track import Track
 from ballfg.vision.camera import Camera
+from ballfg.vision.detection.detections import Detections
 
 STEP: Final = 0.2
 """Pictures between guessed times of a bounce."""
@@ -235,3 +242,15 @@ class Grower:
             if misfit.min() < stroke.path.misfit[0]:
                 stroke = self.flown(stroke.rows, tuple(times[int(np.argmin(misfit))].tolist()))
         return stroke
+
+
+def track_of(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel, surfaces: Surfaces) -> Track:
+    """A stroke as a track of sightings with known bounces, and with the radii that the candidates have."""
+    rows = stroke.rows
+    parts = np.zeros(len(rows), dtype=np.int64), seen.times[rows], seen.pixels[rows], seen.covariances[rows]
+    bounces = written(stroke.bounces, float(seen.frames[0])) - camera.time_offset
+    way = np.nan_to_num(seen.streaks[rows, 1] - seen.streaks[rows, 0])
+    shifts = None if seen.shifts is None else seen.shifts[seen.frame[rows]]
+    radii = seen.radii[rows] if (seen.radii[rows, 0] > 0.0).any() else None
+    sightings = with_ends(Sightings((camera.name,), *parts, radii, way, shifts), [camera])
+    return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)

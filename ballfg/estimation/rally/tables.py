@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.rally.files import COURT, EVENTS, FILES, MOTION, STATES, STROKES
 from ballfg.estimation.rally.moments import Event
 from ballfg.estimation.rally.reconstruct import ShotRally
 from ballfg.estimation.result import Estimate
@@ -17,6 +16,7 @@ from ballfg.tracks import TableWriter
 from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
 from ballfg.tracks.rows import KEY
+from ballfg.vision.broadcast.files import COURT, EVENTS, FILES, MOTION, STATES, STROKES
 from ballfg.vision.broadcast.lines import moved
 from ballfg.vision.broadcast.motion import Motion
 from ballfg.vision.broadcast.pinhole import Pinhole

@@ -1,7 +1,7 @@
 """Holds the candidates of a frame and of a recording, reads them from tables, and defines a detector."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Self
 
@@ -17,7 +17,11 @@ from ballfg.tracks.sightings import are_covariances
 from ballfg.vision.arrays import Image
 from ballfg.vision.camera import Camera
 
-_SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}  # of each
+_SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2), "radii": (2,)}  # of each
+UNKNOWN_RADIUS: Final = (0.0, 1.0)
+"""px, in place of a radius and its standard deviation."""
+UNSIZED: Final = np.zeros((0, 2))
+"""In place of radii: all unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,8 @@ class Candidates:
     """(k,) dimensionless, in [0, 1], similarity to a ball."""
     streaks: Array
     """(k, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
+    radii: Array = field(default_factory=UNSIZED.copy)
+    """(k, 2) px, radius in the picture, 0 where unknown, and its standard deviation; by default all unknown."""
 
     def __post_init__(self) -> None:
         _check_fields(self, "candidates")
@@ -89,6 +95,8 @@ class Detections:
     """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
     shifts: Array | None = None
     """(f, 3) m, where the camera stood in each frame, from its own place; None: it did not move."""
+    radii: Array = field(default_factory=UNSIZED.copy)
+    """(n, 2) px, radius in the picture, 0 where unknown, and its standard deviation; by default all unknown."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, str):
@@ -132,11 +140,11 @@ class Detections:
     def in_frame(self, number: int) -> Candidates:
         """The candidates of one frame."""
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
-        return Candidates(*(getattr(self, field)[rows] for field in _SHAPES))
+        return Candidates(*(getattr(self, name)[rows] for name in _SHAPES))
 
     def select(self, keep: Mask) -> Self:
         """The detections with the candidates of `keep` (n,) bool, and all frames."""
-        return replace(self, **{field: getattr(self, field)[keep] for field in ("frame", *_SHAPES)})
+        return replace(self, **{name: getattr(self, name)[keep] for name in ("frame", *_SHAPES)})
 
     def best_scores(self, count: int = 3) -> Array:
         """(k,) dimensionless, the highest scores, best first, with k at most `count`."""
@@ -155,12 +163,12 @@ class Detections:
             camera,
             np.array(stamps, dtype=np.float64),
             np.repeat(np.arange(len(stamps)), [len(candidates) for candidates in found[1:]]),
-            *(np.concatenate([getattr(candidates, field) for candidates in found]) for field in _SHAPES),
+            **{name: np.concatenate([getattr(candidates, name) for candidates in found]) for name in _SHAPES},
         )
 
 
-def _numbers(what: str, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = check_array(f"{what}: {field}", value, shape, "Pass one row per candidate.")
+def _numbers(what: str, name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = check_array(f"{what}: {name}", value, shape, "Pass one row per candidate.")
     array.setflags(write=False)
     return array
 
@@ -168,18 +176,21 @@ def _numbers(what: str, field: str, value: ArrayLike, shape: tuple[int, ...]) ->
 def _check_fields(owner: Candidates | Detections, what: str) -> None:
     """Checks the fields that candidates of a frame and of a recording share."""
     count = len(np.asarray(owner.pixels))
-    for field, shape in _SHAPES.items():
-        object.__setattr__(owner, field, _numbers(what, field, getattr(owner, field), (count, *shape)))
-    for field in ("pixels", "covariances", "scores"):
-        finite = np.isfinite(getattr(owner, field))
-        _refuse(~finite.all(axis=tuple(range(1, finite.ndim))), what, field, "be finite")
+    if len(owner.radii) == 0:
+        object.__setattr__(owner, "radii", np.tile(UNKNOWN_RADIUS, (count, 1)))
+    for name, shape in _SHAPES.items():
+        object.__setattr__(owner, name, _numbers(what, name, getattr(owner, name), (count, *shape)))
+    for name in ("pixels", "covariances", "scores", "radii"):
+        finite = np.isfinite(getattr(owner, name))
+        _refuse(~finite.all(axis=tuple(range(1, finite.ndim))), what, name, "be finite")
     _refuse(~are_covariances(owner.covariances), what, "covariances", "be symmetric and positive definite")
     _refuse((owner.scores < 0.0) | (owner.scores > 1.0), what, "scores", "lie in [0, 1]")
+    _refuse((owner.radii[:, 0] < 0.0) | (owner.radii[:, 1] <= 0.0), what, "radii", "be a radius and a sigma above zero")
 
 
-def _refuse(wrong: Mask, what: str, field: str, rule: str) -> None:
+def _refuse(wrong: Mask, what: str, name: str, rule: str) -> None:
     if wrong.any():
-        raise ValueError(f"{what}: {field} must {rule}; those of candidate {int(np.argmax(wrong))} do not.")
+        raise ValueError(f"{what}: {name} must {rule}; those of candidate {int(np.argmax(wrong))} do not.")
 
 
 REQUIRED: Final = ("t", detections_file.CAMERA, "u", "v")
@@ -199,7 +210,7 @@ def read_detections(
 
     Args:
         path: `t` (s, as the camera writes it), `camera`, `u`, `v` (px), optionally `sigma_u`, `sigma_v` (px), `rho_uv`,
-            `score`, and the columns `SHIFT` (m).
+            `radius` and `sigma_radius` (px), `score`, and the columns `SHIFT` (m).
         ignored: names of cameras whose rows are passed over.
     Returns: detections in the order of the cameras, and what was ignored, one sentence each.
     Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range, an
@@ -232,8 +243,10 @@ def read_detections(
         way[(way == 0.0).all(axis=1)] = np.nan
         streaks = (pixels[:, None] + 0.5 * way[:, None] * np.array([[-1.0], [1.0]]))[order]
         spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
+        radii = detections_file.radii_of(mine)[order]
         shifts = detections_file.shifts_of(mine)
         shifts = None if shifts is None else shifts[first]
-        found.append(Detections(camera.name, frames, frame[order], pixels[order], spread, scores, streaks, shifts))
+        own = (frame[order], pixels[order], spread, scores, streaks, shifts, radii)
+        found.append(Detections(camera.name, frames, *own))
         check_step(f"{path}, camera {shown(camera.name)}", frames)
     return found, notes

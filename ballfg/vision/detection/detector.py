@@ -15,12 +15,13 @@ from ballfg.vision.arrays import Array32, Image
 from ballfg.vision.camera import MOST_PIXELS
 from ballfg.vision.detection.background import Background, Region, find_regions
 from ballfg.vision.detection.detections import Candidates
-from ballfg.vision.detection.streak import LOOK, Look, Patch, StreakFit, fit_streak, start, swept
+from ballfg.vision.detection.streak import LOOK, RADIUS, Look, Patch, StreakFit, fit_streak, start, swept
 
 Colour = Literal["white", "orange"]
 
 MODEL_ERROR: Final = 0.02  # px per px of blotches, sigma of every centre besides noise: compression moves edges
 LEARNS: Final = 0.8  # score from which a candidate teaches what edge and shading to expect
+SIZED: Final = 0.05  # score up to which no radius is stated: shape or edge are not a ball's
 FORGETS: Final = 0.98  # factor on earlier information per teaching candidate: the light on the ball changes as it flies
 SUREST: Final = (0.15, 0.08, 0.08)  # least sigmas of the expected edge (px) and shading: they change along a flight
 VISIBLE_STREAK: Final = 3.0  # px, and sigmas of its length: a shorter streak's direction is chance
@@ -94,7 +95,10 @@ class BallDetector:
         halves[(lengths < VISIBLE_STREAK) | (lengths < VISIBLE_STREAK * spread)] = np.nan
         floor = MODEL_ERROR * self.background.blotches
         of_centres, scores = covariances[:, :2, :2] + floor**2 * np.eye(2), np.array([mark for _, mark in rated])
-        return Candidates(centres, of_centres, scores, np.stack((centres - halves, centres + halves), axis=1))
+        radii = np.array(
+            [(fit.radius * (mark > SIZED), np.sqrt(fit.covariance[RADIUS, RADIUS])) for fit, mark in rated]
+        )
+        return Candidates(centres, of_centres, scores, np.stack((centres - halves, centres + halves), axis=1), radii)
 
     def _fitted(self, image: Image, region: Region) -> tuple[StreakFit, float] | None:
         """The swept disc that explains a region, in pixels of the image, and its score; None where none does."""

@@ -85,12 +85,14 @@ def write_tracking(
         write_cameras(stage / CAMERAS_FILE, tracking.cameras)
         with TableWriter(stage / DETECTIONS_FILE) as detections:
             exposed = any(camera.exposure > 0.0 for camera in tracking.cameras)  # else a streak says nothing
+            sized = any(ball.sightings.radii is not None for ball in tracking.balls)
             for camera, seen in enumerate(tracking.detections):
                 names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
                 for name, ball in zip(tracking.names, tracking.balls, strict=True):
                     names[tracking.rows(ball, camera)] = name
                 own = (seen.times, seen.camera, seen.pixels, seen.covariances)
-                columns = seen_columns(*own, seen.streaks if exposed else None, seen.shift)
+                cues = (seen.streaks if exposed else None, seen.shift, seen.radii if sized else None)
+                columns = seen_columns(*own, *cues)
                 detections.write({KEY: names} | columns | {SCORE: seen.scores})
         sheet = ContactSheet(tracking, info.table_height, table)
         passing = [sheet.passing(camera, opened()) for camera, opened in enumerate(streams or ())]

@@ -18,7 +18,6 @@ from ballfg.benchmarks.cameras.strokes import MODEL
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.rally.events import end_of, events_in_play, net_touches, stroke_row
-from ballfg.estimation.rally.files import is_rally
 from ballfg.estimation.rally.hits import HIT_SIGMA
 from ballfg.estimation.rally.moments import carried
 from ballfg.estimation.rally.page import between, rally_page
@@ -29,6 +28,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.state import POSITION
 from ballfg.tracks import TABLE_TENNIS
 from ballfg.tracks.info import DatasetInfo
+from ballfg.vision.broadcast.files import is_rally
 from tests.browser import needs_browser, opened
 from tests.commands import status
 from tests.estimation.rally.planted import SURFACES, planted

@@ -22,6 +22,7 @@ def test_frames_are_joined() -> None:
     assert (len(seen), len(seen.in_frame(1)), len(seen.in_frame(2))) == (3, 0, 1)
     assert np.isnan(seen.streaks).all()
     np.testing.assert_array_equal(seen.covariances, np.tile(0.25 * np.eye(2), (3, 1, 1)))
+    np.testing.assert_array_equal(seen.radii, np.tile([0.0, 1.0], (3, 1)))  # not known
 
 
 def test_best_scores_come_first() -> None:
@@ -48,6 +49,8 @@ def test_arrays_cannot_be_changed() -> None:
         ({"covariances": [[[1.0, 0.5], [0.2, 1.0]]]}, "covariances must be symmetric"),
         ({"covariances": [[[1.0, 2.0], [2.0, 1.0]]]}, "covariances must be symmetric and positive definite"),
         ({"scores": [1.5]}, r"scores must lie in \[0, 1\]"),
+        ({"radii": [[3.0, 0.0]]}, "radii must be a radius and a sigma above zero; those of candidate 0"),
+        ({"radii": [[np.nan, 1.0]]}, "radii must be finite"),
         ({"frame": [1]}, "frame must be numbers from 0 to 0 in order"),
         ({"frame": [0, 0]}, r"frame must have shape \(1,\)"),
         ({"frames": [0.0, 0.0]}, r"frames must be strictly increasing; frames\[1\]=0.0 after 0.0"),

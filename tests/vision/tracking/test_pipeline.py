@@ -305,6 +305,14 @@ def test_a_table_of_four_columns_in_any_order_is_enough(tmp_path: Path) -> None:
     assert right.pixels.tolist() == [[5.0, 6.0], [1.0, 2.0], [7.0, 8.0]]
     assert right.scores.tolist() == [1.0] * 3
     assert right.covariances[0].tolist() == [[0.25, 0.0], [0.0, 0.25]]
+    assert right.radii[:, 0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_table_may_hold_radii(tmp_path: Path) -> None:
+    path = tmp_path / "detections.csv"
+    path.write_text("t,camera,u,v,radius,sigma_radius\n0.1,left,1,2,4.5,0.2\n0.2,left,3,4,0,1\n")
+    (left,), notes = read_detections(path, [RIG[0]])
+    assert (left.radii.tolist(), notes) == ([[4.5, 0.2], [0.0, 1.0]], [])
 
 
 @pytest.mark.parametrize(

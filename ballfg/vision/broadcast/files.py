@@ -1,4 +1,4 @@
-"""Names the files of a rally, so that a command knows one without the rest of this room."""
+"""Names the files of a rally before a moving camera, so that a command knows one without the estimation of it."""
 
 from pathlib import Path
 from typing import Final

@@ -1,0 +1,100 @@
+"""Tells the strokes of a ball from those of other things, which move as smoothly as a ball does, and fall less.
+
+Bounces that show in the picture make a stroke a ball's for sure. What these say of the errors of radii and of the usual
+spin decides about the others: a ball's radius and its fall tell how far away it is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.noise.radii import RadiusNoise, too_large
+from ballfg.estimation.rally.arcs import NOISE
+from ballfg.estimation.rally.field import Field
+from ballfg.estimation.rally.sequence import Chosen
+from ballfg.estimation.rally.strokes import Stroke, track_of
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.progress import Watch, unwatched
+from ballfg.state import SPIN, VELOCITY
+from ballfg.vision.camera import Camera
+from ballfg.vision.detection.detections import UNKNOWN_RADIUS, Detections
+
+ANY_SPIN: Final = 1000.0
+"""rad/s, the largest that a flight needs which goes through the candidates of something that does not fall."""
+LEVEL: Final = 1e-6
+"""m/s, at least, along the ground: the axis across a flight straight up is none."""
+
+
+def shows_bounce(chosen: Chosen, field: Field) -> list[bool]:
+    """True for strokes that are surely a ball's: a bounce shows in the picture, which no parabola explains."""
+    return [bool(stroke.bounces) and field.off(stroke.rows, 2) > NOISE for stroke in chosen.strokes]
+
+
+def kept_of(chosen: Chosen, keep: Sequence[bool], strokes: Sequence[Stroke] | None = None) -> Chosen:
+    """Some of the chosen strokes. Args: strokes: what they are now; None: as chosen."""
+    kept, now = [number for number, one in enumerate(keep) if one], chosen.strokes if strokes is None else strokes
+    joined = tuple(chosen.joined[number] and keep[number - 1] for number in kept)
+    return Chosen(tuple(now[number] for number in kept), chosen.probabilities[kept], joined)
+
+
+def balls(
+    smoother: Smoother,
+    seen: Detections,
+    radii: Array,
+    camera: Camera,
+    chosen: Chosen,
+    sure: Sequence[bool],
+    watch: Watch = unwatched,
+) -> tuple[Chosen, Detections]:
+    """The strokes that are a ball's, and the candidates with the true radii of these.
+
+    What shows no bounce is taken without one, if its fall and its radius tell how far away it is, and its spin is one
+    of a ball. What shows one has an estimate.
+
+    Args: seen: candidates without radii.  radii: (n, 2) px, theirs as measured.  sure: of the strokes, `shows_bounce`.
+    """
+    strokes, ball, off = list(chosen.strokes), list(sure), list[Array]()
+    spins = [smoother.settings.one_view_spin[1]]
+    for number in np.flatnonzero(sure).tolist():
+        own = radii[strokes[number].rows]
+        track = track_of(strokes[number], seen, camera, smoother.model, smoother.surfaces)
+        found = smoother.estimate(track)
+        ball[number] = not found.status.failed
+        if found.status is Status.OK:
+            spins.append(_spin_across(found)[0])
+            off += [too_large(track, found, own, smoother.model.radius)] if (own[:, 0] > 0.0).any() else []
+    errors, usual = RadiusNoise.of(off), float(np.sqrt(np.mean(np.square(spins))))
+    true = np.tile(UNKNOWN_RADIUS, (len(seen), 1))
+    for stroke in strokes:
+        true[stroke.rows] = errors.corrected(radii[stroke.rows])
+    sized, doubtful = replace(seen, radii=true), np.flatnonzero(~np.array(sure, dtype=bool)).tolist()
+    for number in watch(doubtful, len(doubtful), "flights without a bounce estimated"):
+        strokes[number] = replace(strokes[number], bounces=())
+        found = smoother.estimate(track_of(strokes[number], sized, camera, smoother.model, smoother.surfaces))
+        ball[number] = found.status is Status.OK and _spins(found, usual)
+    kept = kept_of(chosen, ball, strokes)
+    rows = np.concatenate([np.zeros(0, dtype=np.int64), *(stroke.rows for stroke in kept.strokes)])
+    true[~np.isin(np.arange(len(seen)), rows)] = UNKNOWN_RADIUS
+    return kept, replace(seen, radii=true)
+
+
+def _spin_across(estimate: Estimate) -> tuple[float, float]:
+    """rad/s, first spin of an estimate about the level axis across its flight, and its standard deviation."""
+    vx, vy, _ = estimate.states[0, VELOCITY]
+    across = np.array([-vy, vx, 0.0]) / max(float(np.hypot(vx, vy)), LEVEL)
+    sigma = np.sqrt(across @ estimate.covariances[0, SPIN, SPIN] @ across)
+    return float(across @ estimate.states[0, SPIN]), float(sigma)
+
+
+def _spins(estimate: Estimate, usual: float) -> bool:
+    """True if its spin is likelier one of balls that spin so, rad/s, than just what carries a thing that hardly falls.
+
+    Any spin up to `ANY_SPIN` is as likely there.
+    """
+    spin, sigma = _spin_across(estimate)
+    variance = usual**2 + sigma**2
+    return bool(-0.5 * (spin**2 / variance + np.log(2.0 * np.pi * variance)) > -np.log(2.0 * ANY_SPIN))
