@@ -59,7 +59,8 @@ def balls(
     """
     strokes, ball, off = list(chosen.strokes), list(sure), list[Array]()
     spins = [smoother.settings.one_view_spin[1]]
-    for number in np.flatnonzero(sure).tolist():
+    bounced, doubtful = np.flatnonzero(sure).tolist(), np.flatnonzero(~np.array(sure, dtype=bool)).tolist()
+    for number in watch(bounced, len(bounced), "flights with a bounce estimated"):
         own = radii[strokes[number].rows]
         track = track_of(strokes[number], seen, camera, smoother.model, smoother.surfaces)
         found = smoother.estimate(track)
@@ -71,7 +72,7 @@ def balls(
     true = np.tile(UNKNOWN_RADIUS, (len(seen), 1))
     for stroke in strokes:
         true[stroke.rows] = errors.corrected(radii[stroke.rows])
-    sized, doubtful = replace(seen, radii=true), np.flatnonzero(~np.array(sure, dtype=bool)).tolist()
+    sized = replace(seen, radii=true)
     for number in watch(doubtful, len(doubtful), "flights without a bounce estimated"):
         strokes[number] = replace(strokes[number], bounces=())
         found = smoother.estimate(track_of(strokes[number], sized, camera, smoother.model, smoother.surfaces))
