@@ -24,8 +24,11 @@ BAR_SIGMA, BAR_SHARE = 1.5, 0.12
 """px, and share of its length, by which a ball's bar differs from its motion while the shutter is open."""
 RING: Final = 3.0
 """px, width of the rings in which bars of all candidates are counted."""
+SIZE_SIGMA, SIZES = 0.25, 0.25
+"""Standard deviation of the logarithm of a ball's radius in the picture about the true one, beside that of the noise:
+soft edges, compression; and the width of the steps in which radii of all candidates are counted."""
 STRAY: Final = 0.1
-"""Share of a ball's bars that are not: a bounce or a shirt within the exposure."""
+"""Share of a ball's bars and radii that are not: a bounce or a shirt within the exposure."""
 ASKEW: Final = 0.5
 """rad between a bar and the motion of its centre."""
 LONG: Final = 8.0
@@ -94,6 +97,16 @@ def bar_gain(x, y, to_x, to_y, usual):
     return math.log(STRAY + (1.0 - STRAY) * ratio)
 
 
+@machine_code(REAL(REAL, REAL, REAL, REAL))
+def size_gain(size, sigma, foretold, common):
+    """Logarithm of how much likelier the logarithm of a radius is a ball's of a foretold one than clutter's."""
+    if not common:
+        return 0.0
+    variance = sigma**2 + SIZE_SIGMA**2
+    ratio = math.exp(-0.5 * (size - foretold) ** 2 / variance) / math.sqrt(2.0 * math.pi * variance) / common
+    return math.log(STRAY + (1.0 - STRAY) * ratio)
+
+
 @machine_code(FLAG(REAL, REAL, REAL, REAL))
 def along(x, y, to_x, to_y):
     """True if a bar lies along a motion, or one of both is short."""
@@ -135,6 +148,19 @@ def _moved(frames, pixels, motion):
             motion[n, axis] = (after * to + before * on) / (before + after) if 0 < n < last else to + on
 
 
+def _sized(radii: Array) -> tuple[Array, Array]:
+    """Logarithms of radii (n, 2) px with their sigmas, and (n,) the density of each among all; 0 where unknown."""
+    known, sizes, common = radii[:, 0] > 0.0, np.zeros_like(radii), np.zeros(len(radii))
+    if known.any():
+        radius, sigma = radii[known].T
+        sizes[known] = np.stack((np.log(radius), sigma / radius), axis=1)
+        step = np.floor(sizes[known, 0] / SIZES).astype(np.int64)
+        step -= step.min()
+        share = (np.bincount(step) + 1.0) / (len(step) + step.max() + 1.0)
+        common[known] = share[step] / SIZES
+    return sizes, common
+
+
 @dataclass(frozen=True, eq=False)
 class Field:
     """The candidates of a recording as one fixed camera would see them, sorted by picture.
@@ -144,6 +170,8 @@ class Field:
         bars: (n, 2) px from end to end, zero where not blurred.
         density: (n,) 1/px^2, of clutter that looks as much like a ball.
         usual: (n,) 1/px^2, density of a bar like each one's among all candidates; 0 of a detector that gives none.
+        sizes: (n, 2) logarithms of radii in px, and their standard deviations.
+        common: (n,) density of a size like each one's among all candidates; 0 where it is not known.
         first: (f + 1,) where each picture's begin.  stamps: (f,) s, of the pictures.  step: s between them, the median.
         scale: px for a m at the court.  exposure: of the step, during which the shutter is open.
         seen: probability that the ball is among the candidates of a picture.
@@ -157,6 +185,8 @@ class Field:
     bars: Array
     density: Array
     usual: Array
+    sizes: Array
+    common: Array
     first: Index
     stamps: Array
     step: float
@@ -179,7 +209,8 @@ class Field:
         share = (np.bincount(number) + 1.0) / (len(bars) + number.max(initial=0) + 1.0)
         usual = share[number] / (np.pi * RING**2 * (2.0 * number + 1.0))  # of rings about a bar of no length
         rows = plain(seen.frame), plain(pixels), plain(seen.covariances), bars, density, usual * bars.any()
-        return cls(*rows, first, seen.frames, step, scale, seen=ball, fall=fall)
+        sizes, common = _sized(seen.radii)
+        return cls(*rows, sizes, common, first, seen.frames, step, scale, seen=ball, fall=fall)
 
     def smooth(self, density: float) -> "Field":
         """The field whose clutter moves smoothly: where its motion foretells a candidate, it has a density, 1/px^2."""

@@ -10,7 +10,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO, several
 from ballfg.estimation.observations.bounced_code import FLOWN, RAYS, SCENE, Flown, flown, share_at
-from ballfg.estimation.rally.field import bar_gain
+from ballfg.estimation.rally.field import bar_gain, size_gain
 
 SHORT: Final = 0.4
 """Of a picture's time, over which a path shows its motion."""
@@ -37,6 +37,8 @@ CANDIDATE: Final = np.dtype(
         ("covariance", np.float64, (2, 2)),
         ("bar", np.float64, (2,)),
         ("usual", np.float64),
+        ("size", np.float64, (2,)),
+        ("common", np.float64),
         ("spot", np.float64),
         ("tvec", np.float64, (3,)),
     ]
@@ -52,9 +54,11 @@ VIEW: Final = np.dtype(
         ("seen", np.float64),
         ("exposure", np.float64),
         ("net", np.float64),
+        ("ball", np.float64),
     ]
 )
-"""The camera, which has no distortion; numbers of `Field`; m, x of the court's middle, NaN where it has no ends."""
+"""The camera, which has no distortion; numbers of `Field`; m, x of the court's middle, NaN where it has no ends; m, the
+ball's radius."""
 ROW: Final[Any] = from_dtype(CANDIDATE)
 CANDIDATES: Final[Any] = ROW[::1]
 VIEWED: Final[Any] = from_dtype(VIEW)
@@ -91,9 +95,12 @@ def _spread(covariance, share, spread):
                     spread[a, b] += share[c] * covariance[3 * c + a, 3 * d + b] * share[d]
 
 
-@machine_code(NOTHING(VIEWED, ROW, ONE, ONE, TWO))
+@machine_code(REAL(VIEWED, ROW, ONE, ONE, TWO))
 def _see(view, row, place, pixels, slope):
-    """Writes where the camera, as it saw a row, sees a place (3,) m, pixels (2,), and their slopes by it (2, 3)."""
+    """Writes where the camera, as it saw a row, sees a place (3,) m, pixels (2,), and their slopes by it (2, 3).
+
+    Returns: m, how far before the camera it is, at least `NEAREST`.
+    """
     at = np.empty(3)
     for r in range(3):
         at[r] = row.tvec[r]
@@ -105,25 +112,28 @@ def _see(view, row, place, pixels, slope):
         pixels[r] = view.focal * seen + view.middle[r]
         for a in range(3):
             slope[r, a] = view.focal * (view.rotation[r, a] - seen * view.rotation[2, a]) / depth
+    return depth
 
 
 @machine_code(REAL(RAYS, CANDIDATES, SCENE, VIEWED, COUNTS, ONE, COUNT, FLOWN))
 def _gain(rays, candidates, scene, view, rows, times, bounces, path):
-    """Logarithm of how much likelier the candidates (n,) of a path are a ball than clutter, by their number and bars.
+    """Logarithm of how much likelier candidates (n,) of a path are a ball than clutter, by number, bars and sizes.
 
     Their distances from the path count in its misfit.
     """
     gain, half = 0.0, 0.5 * SHORT * view.step
     share, at, slope, ends = np.empty(len(path.vectors)), np.empty(3), np.empty((2, 3)), np.empty((2, 2))
     for row in rows:
+        depth = 0.0
         for end in range(2):
             moment = rays[row].time + (half if end else -half)
             drop = share_at(moment, times, bounces, path.drag, scene.gravity, share)
             _place(path.vectors, share, drop, at)
-            _see(view, candidates[row], at, ends[end], slope)
+            depth += 0.5 * _see(view, candidates[row], at, ends[end], slope)
         one, long = candidates[row], view.exposure / SHORT
         x, y = long * (ends[1, 0] - ends[0, 0]), long * (ends[1, 1] - ends[0, 1])
         gain += one.spot + bar_gain(one.bar[0], one.bar[1], x, y, one.usual)
+        gain += size_gain(one.size[0], one.size[1], math.log(view.focal * view.ball / depth), one.common)
     passed = candidates[rows[-1]].frame - candidates[rows[0]].frame + 1 - len(rows)
     return gain + passed * math.log(1.0 - view.seen)
 

@@ -107,13 +107,15 @@ class Grower:
         """Rays, candidates, scene and view for machine code."""
         field, camera = self.field, self.camera
         found = np.zeros(len(field.frame), dtype=CANDIDATE)
-        own = (field.frame, field.pixels, field.covariances, field.bars, field.usual, field.spot, self.tvec)
+        sizes = (field.sizes, field.common, field.spot)
+        own = (field.frame, field.pixels, field.covariances, field.bars, field.usual, *sizes, self.tvec)
         for name, values in zip(CANDIDATE.names or (), own, strict=True):
             found[name] = values
         ends = ends_of(self.scene.surfaces)
         net = np.nan if ends is None else float(ends[0].mean())
         lens = (camera.rotation, camera.matrix[0, 0], camera.matrix[:2, 2])
-        view = np.array([(*lens, field.step, field.seen, field.exposure, net)], dtype=VIEW)[0]
+        seen = (*lens, field.step, field.seen, field.exposure, net, self.scene.physics.radius)
+        view = np.array([seen], dtype=VIEW)[0]
         return self.scene.sightings, found, self.scene.numbers, view
 
     def flown(self, rows: Index, bounces: tuple[float, ...]) -> Stroke:

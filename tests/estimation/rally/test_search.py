@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from ballfg.benchmarks.cameras.films import Truth
 from ballfg.estimation.rally import hits as hits_of
 from ballfg.estimation.rally.arcs import Foretold
+from ballfg.estimation.rally.field import SIZE_SIGMA, SIZES, STRAY
 from ballfg.estimation.rally.growth import halves, rated
 from ballfg.estimation.rally.hits import Hits
 from ballfg.estimation.rally.sequence import BEGINS, MOST_BOUNCES, PAUSE, SERVED, VOLLEY, best_sequence
@@ -229,3 +230,33 @@ def test_strokes_are_told_apart_by_their_score(made: tuple[Truth, Shot, Grower, 
     wrong: Stroke = grower.flown(false, (bounce,))
     assert stroke.score > 20.0
     assert wrong.score < 0.0
+
+
+def test_radii_count_as_much_as_a_balls_are_denser_than_those_of_all_candidates() -> None:
+    of, motion, found = planted("side", 11)
+    shot, rng = motion.shots[0], np.random.default_rng(4)
+    plain, _ = grower_of(found, shot)
+    stroke, bounce = true_stroke(of, 0, plain, shot)
+    times, camera = plain.scene.rays.times[stroke.rows], plain.camera
+    depth = plain.places_of(stroke.path, times)[0] @ camera.rotation[2] + camera.tvec[2]
+    foretold = camera.matrix[0, 0] * plain.scene.physics.radius / depth
+    radii = np.exp(rng.uniform(np.log(2.0), np.log(20.0), len(found)))
+    radii[stroke.rows] = 1.1 * foretold
+    radii[stroke.rows[0]] = 3.0 * foretold[0]  # a shirt behind it
+    sigma = 0.1 * radii
+    unknown = int(stroke.rows[1])
+    given = np.stack((np.where(np.arange(len(found)) == unknown, 0.0, radii), sigma), axis=1)
+    grower, _ = grower_of(replace(found, radii=given), shot)
+    sized = grower.flown(stroke.rows, (bounce,))
+    field, known = grower.field, given[:, 0] > 0.0
+    step = np.floor(np.log(radii) / SIZES)
+    among = step[known]
+    shares = [(among == one).sum() + 1.0 for one in step] / (len(among) + among.max() - among.min() + 1.0)
+    common = shares / SIZES
+    np.testing.assert_allclose(field.common[known], common[known])
+    assert field.common[unknown] == 0.0
+    ball = norm(np.log(foretold), np.sqrt(0.1**2 + SIZE_SIGMA**2)).pdf(np.log(radii[stroke.rows]))
+    gain = np.log(STRAY + (1.0 - STRAY) * ball / common[stroke.rows])[known[stroke.rows]]
+    assert sized.score - stroke.score == pytest.approx(gain.sum(), rel=1e-3)
+    assert gain[0] == pytest.approx(np.log(STRAY), abs=0.1)
+    assert gain[1:].min() > 0.5
