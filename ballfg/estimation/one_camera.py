@@ -57,8 +57,7 @@ def track_one_camera(
     seen, pairs = found.seen, list[tuple[Estimate, SeenBall]]()
     for stroke, estimate in zip(found.chosen.strokes, found.estimates, strict=True):
         own = (seen.times[stroke.rows], seen.pixels[stroke.rows], seen.covariances[stroke.rows])
-        radii = seen.radii[stroke.rows] if (seen.radii[stroke.rows, 0] > 0.0).any() else None
-        sightings = Sightings((camera.name,), np.zeros(len(stroke.rows), dtype=np.int64), *own, radii)
+        sightings = Sightings((camera.name,), np.zeros(len(own[0]), dtype=np.int64), *own, seen.radii_of(stroke.rows))
         spread, views = estimate.covariances[:, POSITION, POSITION], np.ones(len(estimate), dtype=np.int64)
         pairs.append((estimate, SeenBall(estimate.times, estimate.states[:, POSITION], spread, sightings, views)))
     pairs.sort(key=lambda pair: pair[0].name)

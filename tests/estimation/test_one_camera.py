@@ -229,7 +229,10 @@ def test_a_lens_with_distortion_and_two_focal_lengths_is_undone(ball: World) -> 
     # a small step in the picture has the length that its covariance says
     (one, *_), step = found.pixels, np.array([0.1, 0.05])
     both = Detections.of_frames("side", [(0.0, Candidates.at([one, one + step], 1.0))])
-    undone, _ = without_lens(both, wide)
+    undone, _ = without_lens(replace(both, radii=[[5.0, 0.2], [0.0, 1.0]]), wide)
+    larger = np.linalg.det(undone.covariances[0]) ** 0.25  # of what has the length of a pixel, in the mean
+    np.testing.assert_allclose(undone.radii[0], [5.0 * larger, 0.2 * larger])
+    assert undone.radii[1, 0] == 0.0
     moved = undone.pixels[1] - undone.pixels[0]
     assert moved @ np.linalg.inv(undone.covariances[0]) @ moved == pytest.approx(step @ step, rel=1e-3)
     assert without_lens(flat, pinhole) == (flat, pinhole)

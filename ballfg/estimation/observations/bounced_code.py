@@ -12,7 +12,7 @@ from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, INDEX, NOTH
 from ballfg.estimation.observations.ray_path import NEAREST, ROBUST, ROUNDS
 
 SPEED: Final = 15.0  # m/s, prior standard deviation of each component of a velocity
-SLOWEST: Final = 0.1  # m/s, for which a flight may have lift
+SLOWEST: Final = 0.1  # m/s, the least speed by which lift is counted
 KEPT: Final = 0.8  # Share of the horizontal velocity that a bounce leaves; friction takes or adds some
 FRICTION_SIGMA: Final = 1.0  # m/s, standard deviation about it: the spin is unknown
 RESTITUTION_SIGMA: Final = 0.15  # m/s, of the vertical velocity after a bounce
@@ -276,10 +276,10 @@ def flown(rays, rows, scene, times, bounces, wide):
             misfit += _off(scene, times, bounces, drag, speed, unknown)
         for flight in range(bounces + 1):
             v = vectors[1 + flight]
-            flown = min(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), 2.0 * SPEED)
-            drag[flight] = scene.drag * flown
-            if turn < ROUNDS - 1:  # the last solution's prior is that of the one before
-                speed[flight] = flown
+            fast = min(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), 2.0 * SPEED)
+            drag[flight] = scene.drag * fast
+            if turn < ROUNDS - 1:  # the last solution has the prior of the one before
+                speed[flight] = fast
     if not wide:
         return Flown(misfit, 0.0, vectors, drag, covariance)
     for i in range(size):

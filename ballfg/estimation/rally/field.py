@@ -75,7 +75,8 @@ def without_lens(seen: Detections, camera: Camera) -> tuple[Detections, Camera]:
 
     slope = np.stack([onto(seen.pixels + step) - onto(seen.pixels - step) for step in 0.5 * np.eye(2)], axis=-1)
     spread = slope @ seen.covariances @ slope.swapaxes(1, 2)
-    flat = replace(seen, pixels=onto(seen.pixels), covariances=spread, streaks=onto(seen.streaks))
+    radii = seen.radii * np.sqrt(np.abs(np.linalg.det(slope)))[:, None]
+    flat = replace(seen, pixels=onto(seen.pixels), covariances=spread, streaks=onto(seen.streaks), radii=radii)
     matrix = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
     return flat, replace(camera, matrix=matrix, distortion=np.zeros(0))
 

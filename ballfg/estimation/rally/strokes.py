@@ -253,6 +253,5 @@ def track_of(stroke: Stroke, seen: Detections, camera: Camera, model: BallModel,
     bounces = written(stroke.bounces, float(seen.frames[0])) - camera.time_offset
     way = np.nan_to_num(seen.streaks[rows, 1] - seen.streaks[rows, 0])
     shifts = None if seen.shifts is None else seen.shifts[seen.frame[rows]]
-    radii = seen.radii[rows] if (seen.radii[rows, 0] > 0.0).any() else None
-    sightings = with_ends(Sightings((camera.name,), *parts, radii, way, shifts), [camera])
+    sightings = with_ends(Sightings((camera.name,), *parts, seen.radii_of(rows), way, shifts), [camera])
     return sighted_track("stroke", sightings, [camera], model=model, surfaces=surfaces, bounces=bounces)

@@ -137,6 +137,10 @@ class Detections:
         """(n, 3) m, where the camera stood as it saw each candidate, from its own place; None: it did not move."""
         return None if self.shifts is None else self.shifts[self.frame]
 
+    def radii_of(self, rows: Index) -> Array | None:
+        """(k, 2) px, radii of some candidates (k,) and their standard deviations; None if all are unknown."""
+        return self.radii[rows] if (self.radii[rows, 0] > 0.0).any() else None
+
     def in_frame(self, number: int) -> Candidates:
         """The candidates of one frame."""
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
