@@ -23,6 +23,8 @@ UNKNOWN: Final = 0.1
 """Prior standard deviation of the logarithm of the factor by which radii are too large; counts as one flight."""
 SHARPEST: Final = 0.02
 """Least scatter of the logarithms of radii within a flight."""
+AGREE: Final = 4.0
+"""Standard deviations by which the radii of a flight differ, in the middle, from those that its depth foretells."""
 TO_SIGMA: Final = 1.4826
 """Of a normal distribution, its standard deviation over the median distance from its median."""
 
@@ -49,6 +51,11 @@ class RadiusNoise:
         apart = TO_SIGMA * float(np.median(np.abs(middles - middle)))
         common = float(np.sqrt((UNKNOWN**2 + count * apart**2) / (1.0 + count)))
         return cls(middle * UNKNOWN**2 / (UNKNOWN**2 + common**2 / count), max(scatter, SHARPEST), common)
+
+    def agrees(self, off: Array) -> bool:
+        """True if a flight of such logarithms (n,) of measured over foretold radii is at the depth that foretells."""
+        sigma = np.hypot(self.common, self.scatter / np.sqrt(len(off)))
+        return bool(np.abs(np.median(off) - self.large) < AGREE * sigma)
 
     def corrected(self, stated: Array) -> Array:
         """(n, 2) px, true radii and standard deviations of a flight for stated ones; 0 stays unknown.

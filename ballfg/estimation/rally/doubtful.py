@@ -14,7 +14,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.noise.radii import RadiusNoise, too_large
 from ballfg.estimation.rally.arcs import NOISE
 from ballfg.estimation.rally.field import Field
-from ballfg.estimation.rally.sequence import Chosen
+from ballfg.estimation.rally.sequence import BEGINS, Chosen
 from ballfg.estimation.rally.strokes import Stroke, track_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.smoother.smoother import Smoother
@@ -52,32 +52,35 @@ def balls(
 ) -> tuple[Chosen, Detections]:
     """The strokes that are a ball's, and the candidates with the true radii of these.
 
-    What shows no bounce is taken without one, if its fall and its radius tell how far away it is, and its spin is one
-    of a ball. What shows one has an estimate.
+    What shows a bounce has an estimate at a depth with which its radii agree. All else is taken without a bounce, if
+    its fall and its radii tell how far away it is, and its spin is one of a ball. A stroke's own candidates must make
+    it likelier than clutter, not just the hits that would join it to others.
 
     Args: seen: candidates without radii.  radii: (n, 2) px, theirs as measured.  sure: of the strokes, `shows_bounce`.
     """
-    strokes, ball, off = list(chosen.strokes), list(sure), list[Array]()
-    spins = [smoother.settings.one_view_spin[1]]
-    bounced, doubtful = np.flatnonzero(sure).tolist(), np.flatnonzero(~np.array(sure, dtype=bool)).tolist()
+    strokes, off, spins = list(chosen.strokes), dict[int, Array](), [smoother.settings.one_view_spin[1]]
+    likely = [number for number, stroke in enumerate(strokes) if stroke.score > BEGINS]
+    bounced = [number for number in likely if sure[number]]
+    ball = np.zeros(len(strokes), dtype=bool)
     for number in watch(bounced, len(bounced), "flights with a bounce estimated"):
         own = radii[strokes[number].rows]
         track = track_of(strokes[number], seen, camera, smoother.model, smoother.surfaces)
         found = smoother.estimate(track)
         ball[number] = not found.status.failed
-        if found.status is Status.OK:
-            spins.append(_spin_across(found)[0])
-            off += [too_large(track, found, own, smoother.model.radius)] if (own[:, 0] > 0.0).any() else []
-    errors, usual = RadiusNoise.of(off), float(np.sqrt(np.mean(np.square(spins))))
+        spins += [_spin_across(found)[0]] if found.status is Status.OK else []
+        if ball[number] and (own[:, 0] > 0.0).any():
+            off[number] = too_large(track, found, own, smoother.model.radius)
+    errors, usual = RadiusNoise.of(list(off.values())), float(np.sqrt(np.mean(np.square(spins))))
+    ball[[number for number, one in off.items() if not errors.agrees(one)]] = False
     true = np.tile(UNKNOWN_RADIUS, (len(seen), 1))
     for stroke in strokes:
         true[stroke.rows] = errors.corrected(radii[stroke.rows])
-    sized = replace(seen, radii=true)
+    sized, doubtful = replace(seen, radii=true), [number for number in likely if not ball[number]]
     for number in watch(doubtful, len(doubtful), "flights without a bounce estimated"):
         strokes[number] = replace(strokes[number], bounces=())
         found = smoother.estimate(track_of(strokes[number], sized, camera, smoother.model, smoother.surfaces))
         ball[number] = found.status is Status.OK and _spins(found, usual)
-    kept = kept_of(chosen, ball, strokes)
+    kept = kept_of(chosen, ball.tolist(), strokes)
     rows = np.concatenate([np.zeros(0, dtype=np.int64), *(stroke.rows for stroke in kept.strokes)])
     true[~np.isin(np.arange(len(seen)), rows)] = UNKNOWN_RADIUS
     return kept, replace(seen, radii=true)

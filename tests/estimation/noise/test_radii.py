@@ -51,6 +51,13 @@ def test_true_radii_are_as_sure_as_they_are_right() -> None:
     assert some[0, 0] == pytest.approx(5.0 * np.exp(-LARGE))
 
 
+def test_radii_agree_with_a_depth_that_is_right_and_not_with_another() -> None:
+    rng, noise = np.random.default_rng(5), RadiusNoise(LARGE, SCATTER, COMMON)
+    flights = off(rng, 1000)
+    assert np.mean([noise.agrees(one) for one in flights]) > 0.998
+    assert not any(noise.agrees(one + 0.25) or noise.agrees(one - 0.25) for one in flights)
+
+
 def test_by_how_much_radii_are_too_large_is_told_by_the_depth() -> None:
     ball, camera = world(), replace(RIG[0], distortion=np.zeros(5))
     flown = scene(3, ball, phases=(0.0,), rig=(camera,))
