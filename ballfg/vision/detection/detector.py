@@ -14,7 +14,7 @@ from ballfg.checks import check_array, check_choice, check_count, check_range
 from ballfg.vision.arrays import Array32, Image
 from ballfg.vision.camera import MOST_PIXELS
 from ballfg.vision.detection.background import Background, Region, find_regions
-from ballfg.vision.detection.detections import Candidates
+from ballfg.vision.detection.detections import UNKNOWN_RADIUS, Candidates
 from ballfg.vision.detection.streak import LOOK, RADIUS, Look, Patch, StreakFit, fit_streak, start, swept
 
 Colour = Literal["white", "orange"]
@@ -95,9 +95,7 @@ class BallDetector:
         halves[(lengths < VISIBLE_STREAK) | (lengths < VISIBLE_STREAK * spread)] = np.nan
         floor = MODEL_ERROR * self.background.blotches
         of_centres, scores = covariances[:, :2, :2] + floor**2 * np.eye(2), np.array([mark for _, mark in rated])
-        radii = np.array(
-            [(fit.radius * (mark > SIZED), np.sqrt(fit.covariance[RADIUS, RADIUS])) for fit, mark in rated]
-        )
+        radii = np.array([radius_of(fit, mark) for fit, mark in rated])
         return Candidates(centres, of_centres, scores, np.stack((centres - halves, centres + halves), axis=1), radii)
 
     def _fitted(self, image: Image, region: Region) -> tuple[StreakFit, float] | None:
@@ -121,6 +119,12 @@ class BallDetector:
         """True if radius and streak are within a factor of two of the limits."""
         low, high = self.settings.diameter
         return bool(low / 4.0 <= values[4] <= high and np.hypot(*values[2:4]) <= self.settings.longest_streak)
+
+
+def radius_of(fit: StreakFit, mark: float) -> tuple[float, float]:
+    """px, radius and standard deviation of a fit with a score; unknown of a thing that has not a ball's shape."""
+    sigma = float(np.sqrt(max(fit.covariance[RADIUS, RADIUS], 0.0)))  # NaN where the fit fell together
+    return (fit.radius, sigma) if mark > SIZED and 0.0 < sigma < np.inf else UNKNOWN_RADIUS
 
 
 def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Array) -> Patch | None:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from ballfg.vision.detection.background import Background
-from ballfg.vision.detection.detector import BallDetector, DetectorSettings, learned
+from ballfg.vision.detection.detections import UNKNOWN_RADIUS
+from ballfg.vision.detection.detector import BallDetector, DetectorSettings, learned, radius_of
 from ballfg.vision.detection.streak import Look, StreakFit
 from tests.vision.drawn import Film, Shot
 
@@ -19,7 +20,7 @@ def run(shots: list[Shot], settings: DetectorSettings | None = None) -> dict[str
     """Errors, NEES, scores of the balls found; best score of anything else; number missed."""
     images = [shot.image for shot in shots]
     detector = BallDetector.learn(images[:: max(1, len(images) // 15)], settings)
-    errors, nees, scores, ends, other = [], [], [], [], [0.0]
+    errors, nees, scores, ends, radii, other = [], [], [], [], [], [0.0]
     for shot in shots:
         found = detector(shot.image)
         far = np.hypot(*(found.pixels - shot.centre).T)
@@ -31,8 +32,9 @@ def run(shots: list[Shot], settings: DetectorSettings | None = None) -> dict[str
         nees.append(errors[-1] @ np.linalg.solve(found.covariances[near], errors[-1]))
         scores.append(found.scores[near])
         ends.append(_end_errors(found.streaks[near], shot))
-    keys = ("errors", "nees", "scores", "ends", "other")
-    return dict(zip(keys, map(np.array, (errors, nees, scores, ends, other)), strict=True))
+        radii.append(found.radii[near])
+    keys = ("errors", "nees", "scores", "ends", "radii", "other")
+    return dict(zip(keys, map(np.array, (errors, nees, scores, ends, radii, other)), strict=True))
 
 
 def _end_errors(streak: np.ndarray, shot: Shot) -> np.ndarray:
@@ -64,6 +66,7 @@ def test_ball_is_found_where_it_is(streak: float, bound: float) -> None:
     assert np.abs(result["errors"].mean(axis=0)).max() < 0.05
     assert np.median(result["scores"]) > 0.9
     assert result["nees"].mean() < 4.0
+    assert np.median(result["radii"][:, 0]) == pytest.approx(6.5, rel=0.02)
     if streak:
         assert rms(result["ends"]) < 0.5
         assert np.isfinite(result["ends"]).all()
@@ -155,3 +158,11 @@ def test_what_was_learned_of_a_ball_s_look_stays_open_to_change() -> None:
     np.testing.assert_allclose(np.diagonal(look.information) ** -0.5, (0.15, 0.08, 0.08), rtol=1e-9)
     once = learned(Look.unknown(), replace(fit, tells=np.eye(3)), 1.0)
     np.testing.assert_allclose(once.information, Look.unknown().information + np.eye(3))  # as little as one ball tells
+
+
+def test_a_radius_is_stated_of_what_has_a_balls_shape() -> None:
+    fit = StreakFit(np.arange(9.0), 0.04 * np.eye(9), np.eye(3), 0.0, 50.0, 1.0, True)
+    assert radius_of(fit, 0.06) == pytest.approx((4.0, 0.2))
+    assert radius_of(fit, 0.05) == UNKNOWN_RADIUS
+    for variance in (np.nan, -0.04, np.inf):  # of a fit that fell together
+        assert radius_of(replace(fit, covariance=np.full((9, 9), variance)), 0.9) == UNKNOWN_RADIUS
