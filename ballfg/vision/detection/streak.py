@@ -17,6 +17,9 @@ from ballfg.arrays import Array
 from ballfg.vision.arrays import Array32
 
 LONGEST_HALF: Final = 15.0  # px, prior sigma of half a streak; it only matters below a pixel
+WIDEST, BRIGHTEST, SINGLE = 100.0, 1e3, 1e-6
+"""px and grey levels, sigmas of centre, radius and contrast of a disc that covers all pixels, of which they show none;
+and share of the information that single precision may hide."""
 NODE_SPACING: Final = 1.8  # px of streak per node: two edge widths, which Gauss-Legendre integrates to 1e-3
 STANDS_OUT: Final = 3.0  # sigmas of noise above which a pixel counts for the first values
 FAINT: Final = 0.3  # share of the strongest contrast: with less, a change's noise would weigh too much
@@ -248,6 +251,10 @@ def _linearised(patch: Patch, values: Array, look: Look) -> tuple[Array, Array, 
     np.multiply(parts[6:], brightness, out=columns[7:])
     normal = (columns @ columns.T).astype(np.float64) / patch.noise**2
     gradient = (columns @ residual).astype(np.float64) / patch.noise**2
+    everywhere = np.arange(9)
+    normal[everywhere, everywhere] *= 1.0 + SINGLE  # positive definite for all the rounding
+    normal[[0, 1, RADIUS], [0, 1, RADIUS]] += WIDEST**-2
+    normal[CONTRAST, CONTRAST] += BRIGHTEST**-2
     normal[[2, 3], [2, 3]] += LONGEST_HALF**-2
     gradient[HALF] -= values[HALF] * LONGEST_HALF**-2
     normal[LOOK, LOOK] += look.information

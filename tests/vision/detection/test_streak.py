@@ -131,3 +131,16 @@ def test_what_is_no_ball_is_given_up() -> None:
     fit = fit_streak(patch, start(patch, Look.unknown()), Look.unknown())
     assert fit.unexplained > 0.15
     assert not fit.settled
+
+
+@pytest.mark.parametrize("radius", [20.0, 25.0])
+def test_a_disc_that_covers_all_pixels_is_anywhere(radius: float) -> None:
+    """Then no pixel tells its centre, and what single precision rounds must not make up any knowledge of it."""
+    x, y = (axis.ravel().astype(np.float32) for axis in np.meshgrid(np.arange(16.0), np.arange(16.0)))
+    for seed in range(3):
+        change = (10.0 + 0.06 * np.random.default_rng(seed).normal(size=256)).astype(np.float32)
+        patch = Patch(x, y, change, np.zeros(256, dtype=np.float32), 100.0, 0.2)
+        fit = fit_streak(patch, np.array([7.5, 7.5, 0.0, 5.0, radius, 10.0, 0.9, 0.0, 0.0]), Look.unknown())
+        sigmas = np.sqrt(np.linalg.eigvalsh(fit.covariance[:2, :2]))
+        np.testing.assert_allclose(sigmas, 100.0, rtol=0.01)
+        assert fit.values[5] == pytest.approx(10.0, abs=0.1)
