@@ -116,7 +116,9 @@ class Estimator(ABC):
                 "made. Make a new one of the samples that are known."
             )
         if len(track) >= LEAST_CHECKED and not track.part:
-            check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, None)
+            # those of a ball that one camera saw are a start of our own, which may lie anywhere along its rays
+            stated = (np.zeros_like(track.positions), None) if track.one_view else (track.positions, track.sigmas)
+            check_scale(f"track {shown(track.name)}", track.times, *stated, None)
         if not self.takes_one_view and track.one_view:
             raise ValueError(
                 f"track {shown(track.name)} must be seen by two cameras for the estimator '{self.name}'; got one. "

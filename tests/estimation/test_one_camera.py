@@ -14,10 +14,13 @@ import torch
 from ballfg.dynamics import Surfaces
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation import Status
+from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.one_camera import Strokes, track_one_camera
 from ballfg.estimation.rally.arcs import BENT, CARRIED, MOSTLY, arcs, telling
 from ballfg.estimation.rally.field import FLATTEST, Field, at_court, without_lens
 from ballfg.estimation.rally.reconstruct import search
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Candidates, Detections
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
@@ -361,3 +364,13 @@ def test_strokes_are_joined_at_hits_and_have_their_bounces(ball: World) -> None:
         np.testing.assert_allclose(moved.times, one.times - 0.5, atol=1e-9)
         np.testing.assert_allclose(moved.states, one.states, rtol=1e-4, atol=1e-3)
         assert [contact.interval for contact in moved.contacts] == [contact.interval for contact in one.contacts]
+
+
+def test_a_start_far_away_along_the_rays_is_no_fault_of_the_units(ball: World) -> None:
+    """Somebody who stands for seconds, taken for one flight that ends on the table: the fall would begin far away."""
+    stamps = np.arange(0.0, 20.0, 1.0 / RATE)
+    pixels = SIDE.project(np.array([[0.3, 0.2, TABLE + 0.02]])) + np.outer(stamps - 20.0, [4.0, 1.0])
+    own = (np.zeros(len(stamps), dtype=np.int64), stamps, pixels, np.tile(NOISE**2 * np.eye(2), (len(stamps), 1, 1)))
+    track = sighted_track("still", Sightings(("side",), *own), [SIDE], bounces=stamps[-2:-1] + 0.01, **ball._asdict())
+    assert np.linalg.norm(np.ptp(track.positions, axis=0)) > 250.0
+    assert Smoother(ball.model, ball.surfaces).estimate(track).status is not Status.OK
