@@ -138,7 +138,10 @@ class Detections:
         return None if self.shifts is None else self.shifts[self.frame]
 
     def radii_of(self, rows: Index) -> Array | None:
-        """(k, 2) px, radii of some candidates (k,) and their standard deviations; None if all are unknown."""
+        """(k, 2) px, radii of some candidates and their standard deviations; None if all are unknown.
+
+        Args: rows: (k,) numbers of the candidates.
+        """
         return self.radii[rows] if (self.radii[rows, 0] > 0.0).any() else None
 
     def in_frame(self, number: int) -> Candidates:
