@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.estimation.measurement.position_noise import MAD_TO_SIGMA
 from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.result import Estimate
 from ballfg.state import POSITION
@@ -24,16 +25,16 @@ UNKNOWN: Final = 0.1
 SHARPEST: Final = 0.02
 """Least scatter of the logarithms of radii within a flight."""
 AGREE: Final = 4.0
-"""Standard deviations by which the radii of a flight differ, in the middle, from those that its depth foretells."""
-TO_SIGMA: Final = 1.4826
-"""Of a normal distribution, its standard deviation over the median distance from its median."""
+"""Standard deviations by which the radii of a flight differ, in the middle, from those that its depth foretells, at
+most."""
 
 
 @dataclass(frozen=True)
 class RadiusNoise:
     """The errors of the logarithms of radii.
 
-    Attributes: large: their mean.  scatter, common: standard deviations, within a flight, and of all of a flight.
+    Attributes: large: their mean.  scatter: their standard deviation within a flight.
+        common: standard deviation of the error that all radii of a flight share.
     """
 
     large: float = 0.0
@@ -46,9 +47,9 @@ class RadiusNoise:
         if not off:
             return cls()
         middles, count = np.array([np.median(one) for one in off]), len(off)
-        scatter = TO_SIGMA * float(np.median(np.abs(np.concatenate([one - np.median(one) for one in off]))))
+        scatter = MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate([one - np.median(one) for one in off]))))
         middle = float(np.median(middles))
-        apart = TO_SIGMA * float(np.median(np.abs(middles - middle)))
+        apart = MAD_TO_SIGMA * float(np.median(np.abs(middles - middle)))
         common = float(np.sqrt((UNKNOWN**2 + count * apart**2) / (1.0 + count)))
         return cls(middle * UNKNOWN**2 / (UNKNOWN**2 + common**2 / count), max(scatter, SHARPEST), common)
 

@@ -15,7 +15,7 @@ from ballfg.estimation.noise.radii import RadiusNoise, too_large
 from ballfg.estimation.rally.arcs import NOISE
 from ballfg.estimation.rally.field import Field
 from ballfg.estimation.rally.sequence import BEGINS, Chosen
-from ballfg.estimation.rally.strokes import Stroke, track_of
+from ballfg.estimation.rally.strokes import track_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
@@ -34,11 +34,11 @@ def shows_bounce(chosen: Chosen, field: Field) -> list[bool]:
     return [bool(stroke.bounces) and field.off(stroke.rows, 2) > NOISE for stroke in chosen.strokes]
 
 
-def kept_of(chosen: Chosen, keep: Sequence[bool], strokes: Sequence[Stroke] | None = None) -> Chosen:
-    """Some of the chosen strokes. Args: strokes: what they are now; None: as chosen."""
-    kept, now = [number for number, one in enumerate(keep) if one], chosen.strokes if strokes is None else strokes
+def kept_of(chosen: Chosen, keep: Sequence[bool]) -> Chosen:
+    """Those of the chosen strokes that are kept, joined where both of a pair are."""
+    kept = [number for number, one in enumerate(keep) if one]
     joined = tuple(chosen.joined[number] and keep[number - 1] for number in kept)
-    return Chosen(tuple(now[number] for number in kept), chosen.probabilities[kept], joined)
+    return Chosen(tuple(chosen.strokes[number] for number in kept), chosen.probabilities[kept], joined)
 
 
 def balls(
@@ -80,10 +80,9 @@ def balls(
         strokes[number] = replace(strokes[number], bounces=())
         found = smoother.estimate(track_of(strokes[number], sized, camera, smoother.model, smoother.surfaces))
         ball[number] = found.status is Status.OK and _spins(found, usual)
-    kept = kept_of(chosen, ball.tolist(), strokes)
-    rows = np.concatenate([np.zeros(0, dtype=np.int64), *(stroke.rows for stroke in kept.strokes)])
-    true[~np.isin(np.arange(len(seen)), rows)] = UNKNOWN_RADIUS
-    return kept, replace(seen, radii=true)
+    for number in np.flatnonzero(~ball).tolist():
+        true[strokes[number].rows] = UNKNOWN_RADIUS
+    return kept_of(replace(chosen, strokes=tuple(strokes)), ball.tolist()), replace(seen, radii=true)
 
 
 def _spin_across(estimate: Estimate) -> tuple[float, float]:

@@ -156,10 +156,13 @@ def _sized(radii: Array) -> tuple[Array, Array]:
         radius, sigma = radii[known].T
         sizes[known] = np.stack((np.log(radius), sigma / radius), axis=1)
         step = np.floor(sizes[known, 0] / SIZES).astype(np.int64)
-        step -= step.min()
-        share = (np.bincount(step) + 1.0) / (len(step) + step.max() + 1.0)
-        common[known] = share[step] / SIZES
+        common[known] = _share(step - step.min()) / SIZES
     return sizes, common
+
+
+def _share(number: Index) -> Array:
+    """(n,) of those in the class of each, by their numbers (n,) from 0 on; one more counts in each class."""
+    return np.asarray(((np.bincount(number) + 1.0) / (len(number) + number.max(initial=0) + 1.0))[number])
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +210,7 @@ class Field:
         step, bars = float(np.median(np.diff(seen.frames))), np.nan_to_num(seen.streaks[:, 1] - seen.streaks[:, 0])
         density = better / count / float(np.prod(np.maximum(size, 1.0)))
         number = (np.linalg.norm(bars, axis=1) // RING).astype(np.int64)
-        share = (np.bincount(number) + 1.0) / (len(bars) + number.max(initial=0) + 1.0)
-        usual = share[number] / (np.pi * RING**2 * (2.0 * number + 1.0))  # of rings about a bar of no length
+        usual = _share(number) / (np.pi * RING**2 * (2.0 * number + 1.0))  # of rings about a bar of no length
         rows = plain(seen.frame), plain(pixels), plain(seen.covariances), bars, density, usual * bars.any()
         sizes, common = _sized(seen.radii)
         return cls(*rows, sizes, common, first, seen.frames, step, scale, seen=ball, fall=fall)

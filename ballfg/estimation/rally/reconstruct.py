@@ -138,8 +138,8 @@ def strokes_of(
         return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     radii, seen = seen.radii, replace(seen, radii=UNSIZED)
-    sure = shows_bounce(chosen, field)
-    telling = chosen if play or not any(sure) else kept_of(chosen, sure)
+    sure = [] if play else shows_bounce(chosen, field)
+    telling = kept_of(chosen, sure) if any(sure) else chosen
     kinked = _kinked(telling, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), telling, kinked)
     seen = _with_noise(seen, noise, kinked)
