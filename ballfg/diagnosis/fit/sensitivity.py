@@ -139,6 +139,13 @@ class _Asked:
         part = self.stretches.take(rows).cropped(count)
         return replace(self, stretches=part, starts=self.starts[rows], values=own)
 
+    def with_leaves(self, *rows: int) -> tuple[BallModel, list[Tensor]]:
+        """The model with its coefficients, and those of the directions, (*rows, n, 1) each, as leaves of a graph."""
+        known = {name: _column(value, len(self.stretches)) for name, value in self.values.items()}
+        names = [direction.name for direction in self.wanted if direction.name is not None]
+        leaves = [known[name].repeat(*rows, 1, 1).requires_grad_() for name in names]
+        return substitute(self.model, known | dict(zip(names, leaves, strict=True))), leaves
+
     def repeated(self) -> tuple[Stretches, BallModel, Tensor]:
         """Stretches, model and first states (d n, 9), repeated direction by direction, as dual numbers."""
         n, d = len(self.stretches), len(self.wanted)
@@ -162,21 +169,70 @@ class _Asked:
 def _compiled_derivatives(functions: CompiledModel, asked: _Asked) -> Sensitivity:
     """All derivatives with the motion in machine code; measurement effects stay in torch."""
     model, stretches, starts, wanted = asked.model, asked.stretches, asked.starts, asked.wanted
-    n, d = len(stretches), len(wanted)
-    moved = np.zeros((*starts.shape, d))
+    n, plainly = len(stretches), model.measures_plainly
+    with torch.no_grad():
+        ends = _true_times(with_values(model, asked.values, n), stretches)[-1]
+    directions = [*wanted] if plainly else [*wanted, _Direction()]  # along the last one only delays grow
+    moved = np.zeros((*starts.shape, len(directions)))
     for block, direction in enumerate(wanted):
         if direction.component is not None:
             moved[:, direction.component, block] = 1.0
-    with torch.no_grad():
-        times = _true_times(with_values(model, asked.values, n), stretches)
-    known = coefficients_of(model, n, asked.values, wanted)
-    shot = shoot_compiled(functions, known, starts, moved, stretches.heights, stretches.contacts, times[-1])
-    motion = RepeatedMotion(shot.arcs, n, d, 1 if model.measures_plainly else 3)
-    if model.measures_plainly:
-        return Sensitivity(motion.states(times)[1].numpy(), moved[:, SPIN])
-    with dual_level():
-        repeated, dual, state = asked.repeated()
-        return Sensitivity(*_measured(dual, motion, _true_times(dual, repeated), state))
+    known = coefficients_of(model, n, asked.values, directions)
+    shot = shoot_compiled(functions, known, starts, moved, stretches.heights, stretches.contacts, ends)
+    motion = RepeatedMotion(shot.arcs, n, len(directions), 1 if plainly else 3)
+    if plainly:
+        return Sensitivity(motion.at(stretches.times.T)[1].numpy(), moved[:, SPIN])
+    return _written(asked, motion, torch.from_numpy(moved[:, SPIN, :-1]))
+
+
+def _written(asked: _Asked, motion: RepeatedMotion, spins_moved: Tensor) -> Sensitivity:
+    """The derivatives of what the instrument writes, by the chain rule.
+
+    It depends on few numbers: on the true states at a sample and at delays after it, and on coefficients. Torch's
+    reverse mode gives its slopes by them, machine code the derivatives of the states.
+
+    Args: motion: with the direction along which delays grow last.  spins_moved: (n, 3, d) of the first spins.
+    """
+    stretches, d = asked.stretches, len(asked.wanted)
+    blocks = [block for block, direction in enumerate(asked.wanted) if direction.name is not None]
+    model, own = asked.with_leaves(stretches.times.shape[1])
+    times, seen = _true_times(model, stretches), list[tuple[Tensor, Tensor]]()
+    moved = torch.zeros((*times.shape, d + 1), dtype=torch.float64)
+    moved[..., blocks] = _slopes(times.unsqueeze(-1), own)[..., 0, :]
+    moved[..., d] = 1.0
+
+    def at(delay: Tensor | float) -> Tensor:
+        shift = torch.as_tensor(delay, dtype=torch.float64)
+        shift = shift.squeeze(-1) if shift.dim() > times.dim() else shift  # a coefficient as it is
+        value, tangent = (one.transpose(0, 1) for one in motion.at((times + shift).detach(), moved))
+        leaf = value.contiguous().requires_grad_()
+        seen.append((leaf, tangent[..., :d]))
+        return leaf + tangent[..., d] * (shift - shift.detach()).unsqueeze(-1)
+
+    measured = model.measured(at(0.0), at)
+    slopes = _slopes(measured, [*(leaf for leaf, _ in seen), *own])
+    positions = torch.zeros((*measured.shape, d), dtype=torch.float64)
+    for number, (_, tangent) in enumerate(seen):
+        by_state = slopes[..., number * STATE_DIM : (number + 1) * STATE_DIM]
+        for axis, part in np.argwhere(np.any(by_state.numpy(), axis=(0, 1))):  # most slopes are zero everywhere
+            positions[..., axis, :] += by_state[..., axis, part, None] * tangent[..., part, :]
+    positions[..., blocks] += slopes[..., len(seen) * STATE_DIM :]
+
+    model, own = asked.with_leaves()
+    spin = torch.from_numpy(asked.starts[:, SPIN]).requires_grad_()
+    slopes = _slopes(model.labelled(spin), [spin, *own])
+    labels = slopes[..., :3] @ spins_moved
+    labels[..., blocks] += slopes[..., 3:]
+    return Sensitivity(positions.transpose(0, 1).numpy(), labels.numpy())
+
+
+def _slopes(outputs: Tensor, leaves: Sequence[Tensor]) -> Tensor:
+    """(..., m, p) derivatives of outputs (..., m) by all components of leaves (..., c): each row by its own one."""
+    if not (outputs.requires_grad and leaves):
+        return outputs.new_zeros((*outputs.shape, sum(leaf.shape[-1] for leaf in leaves)))
+    columns = (outputs[..., part].sum() for part in range(outputs.shape[-1]))
+    found = (torch.autograd.grad(c, leaves, retain_graph=True, materialize_grads=True) for c in columns)
+    return torch.stack([torch.cat(one, dim=-1) for one in found], dim=-2)
 
 
 def _derivatives(asked: _Asked) -> Sensitivity:

@@ -36,13 +36,15 @@ class RepeatedMotion:
     def states(self, times: Tensor) -> tuple[Tensor, Tensor]:
         """States at dual or plain times (k, n) or (k, d n) s, and their derivatives: (n, k, 9) and (n, k, 9, d)."""
         when, moved = _taken_apart(times)
-        when = when[:, : self.balls].T
-        if moved is not None:
-            moved = moved.reshape(len(times), -1, self.balls).permute(2, 0, 1)
-        value = np.zeros((*when.shape, 3 * self.parts))
+        later = None if moved is None else moved.reshape(len(times), -1, self.balls).transpose(1, 2)
+        return self.at(when[:, : self.balls], later)
+
+    def at(self, when: Tensor, moved: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """The same at times (k, n) s with derivatives (k, n, d); None: that do not move."""
+        asked = np.ascontiguousarray(when.T.numpy())
+        value = np.zeros((*asked.shape, 3 * self.parts))
         tangent = np.zeros((*value.shape, self.directions))
-        asked = np.ascontiguousarray(when.numpy())
-        later = np.zeros((*when.shape, 0)) if moved is None else np.ascontiguousarray(moved.numpy())
+        later = np.zeros((*asked.shape, 0)) if moved is None else np.ascontiguousarray(moved.transpose(0, 1).numpy())
         for number, arc in enumerate(self.arcs):
             sample(number == 0, asked, later, *arc.arrays, self.parts, value, tangent)
         return torch.from_numpy(value), torch.from_numpy(tangent)

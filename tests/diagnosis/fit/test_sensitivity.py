@@ -68,6 +68,38 @@ def test_a_present_effect(make_ball, stretches, name):
     assert_same(found.labels @ np.array(list(step.values())), labels, 1e-7)
 
 
+MEASURING = [name for name, effect in EFFECTS.items() if effect.kind == "measurement"]
+
+
+@pytest.mark.parametrize("rows", [[0, 1, 2], [1]], ids=["three", "alone"])
+@pytest.mark.parametrize("chosen", [*([name] for name in MEASURING), MEASURING], ids=lambda chosen: "+".join(chosen))
+def test_the_chain_rule_gives_what_dual_numbers_give(make_ball, stretches, chosen, rows):
+    """By first states and all coefficients, alone and with the instrument's errors one upon another."""
+    own = {
+        name: {c.name: c.default + 0.1 * c.sigma * (i + 1) for i, c in enumerate(EFFECTS[name].coefficients)}
+        | SHIFTED.get(name, {})
+        for name in chosen
+    }
+    model, values = make_ball(**own), {"flight.drag.k": 0.1}
+    for name in chosen:
+        values |= parameters(name, own[name])
+    part, names = stretches.take(rows), tuple(values)
+    chained = sensitivity(model, part, part.starts.numpy(), values, names)
+    dual = sensitivity(model, part, part.starts.numpy(), values, names, shapes=[{}] * len(names))
+    for found, wanted in ((chained.positions, dual.positions), (chained.labels, dual.labels)):
+        largest = np.abs(wanted).reshape(-1, wanted.shape[-1]).max(axis=0)
+        assert (np.abs(found - wanted) <= 1e-7 * largest + 1e-12).all()
+
+
+def test_the_chain_rule_shares_a_kink_out_as_dual_numbers_do(make_ball, stretches):
+    """Of three equal offsets each is the smallest."""
+    values = {f"measurement.time_offset.{a}": 0.0 for a in "xyz"}
+    model, starts = make_ball(time_offset={}), stretches.starts.numpy()
+    chained = sensitivity(model, stretches, starts, values, tuple(values)).positions
+    dual = sensitivity(model, stretches, starts, values, tuple(values), shapes=[{}] * 3).positions
+    np.testing.assert_allclose(chained, dual, rtol=0, atol=1e-7 * np.abs(dual).max())
+
+
 def test_equal_time_offsets_differ_from_central_differences_by_a_shift_of_the_clock(make_ball, stretches, surfaces):
     """At the kink the smallest of three is shared out in thirds; central differences see it half of the time."""
     model = make_ball(time_offset={})
