@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.prior import centres
+from ballfg.diagnosis.evidence.rows import Motion
 from ballfg.diagnosis.evidence.sets import Sets
-from ballfg.diagnosis.evidence.weighed import Weighed
+from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_coefficients, without_effect
@@ -104,6 +106,12 @@ def smaller_fit(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:
         if np.isfinite(found.cost):
             return found
     return without_named(fit, gone, first)
+
+
+def weighed_without(model: Weighed, gone: Sequence[Hypothesis], first: Fit, motion: Motion, halves: Mask) -> Weighed:
+    """A model without some of its effects, from where `smaller_fit` leads.  Args: as of `smaller_fit`, `weighed`."""
+    kept = [h for h in model.named if h not in gone]
+    return weighed(smaller_fit(model, gone, first), kept, motion, halves, model)
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:

@@ -20,7 +20,7 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.changed_fits import model_of, smaller_fit
+from ballfg.diagnosis.search.changed_fits import model_of, smaller_fit, weighed_without
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
 from ballfg.diagnosis.search.trial import offered_varying, screen_of, try_hypotheses, try_varying
@@ -205,20 +205,23 @@ class Found:
             self.best = self.models[best.names] = replace(best, neighbours=neighbours)
         loop.watch("weighing what has no name")
         nothing = self.models[frozenset()]  # a name has to beat that at its best
+        beside = []
         for model in {m.names: m for m in (nothing, self.best)}.values():
-            best = weighed(model.fit, model.named, self.motion, self.halves, model, self.patterns)
-            self.models[best.names] = best
+            found = weighed(model.fit, model.named, self.motion, self.halves, model, self.patterns)
+            self.models[found.names] = found
+            beside.append(found)
         scores = self.scores
         if NAMELESS not in max(scores, key=lambda names: scores[names]):
             return
         loop.watch("weighing sets of effects beside it")
-        varying = offered_varying(best, loop.of_some or loop.catalogue, self.ways)
-        screen = screen_of(best, self.motion, loop.catalogue, varying, self.patterns)
-        sets = Sets.near(screen, MOST_EFFECTS)
-        self.sets.append(sets)
-        self.models[best.names] = replace(best, neighbours=sets.weights)
+        for model in beside:
+            varying = offered_varying(model, loop.of_some or loop.catalogue, self.ways)
+            sets = Sets.near(screen_of(model, self.motion, loop.catalogue, varying, self.patterns), MOST_EFFECTS)
+            self.sets.append(sets)
+            self.models[model.names] = replace(model, neighbours=sets.weights)
         scores = self.scores
-        self.best = self._model(max((*self.models, *sets.members), key=lambda names: scores[names]))
+        names = max((*self.models, *(n for sets in self.sets for n in sets.members)), key=lambda names: scores[names])
+        self.best = self._model(names)
 
     def _model(self, names: frozenset[str]) -> Weighed:
         """A model weighed before, or that of a set of effects beside something nameless."""
@@ -287,19 +290,26 @@ class Found:
 
         It is weighed again from there if the linearisation says that it was found in a poorer minimum before.
         """
-        model = model or self.best
-        lost = {h.effect.name for h in gone if not has_effect(self.first.problem.model, h.effect.name)}
-        gone = [h for h in model.named if h in gone or lost & set(h.effect.needs)]
-        kept = tuple(h for h in model.named if h not in gone)
-        names = frozenset(h.name for h in kept)
-        known = self.models.get(names)
-        poor = known is not None and names in model.nested and known.score < model.nested[names].score - WORTH_A_STEP
-        if known is None or (poor and (model.names, names) not in self.tried):
-            self.tried.add((model.names, names))
-            fit = smaller_fit(model, gone, self.first)
-            found = weighed(fit, kept, self.motion, self.halves, model)
-            self.models[names] = found if known is None else max(known, found, key=SCORE)
-        return self.models[names]
+        return self._without_each([gone], model or self.best)[0]
+
+    def _without_each(self, each: Iterable[Sequence[Hypothesis]], model: Weighed) -> list[Weighed]:
+        """The models without some effects or others, side by side."""
+        asked, tasks = list[frozenset[str]](), dict[frozenset[str], Callable[[], Weighed]]()
+        for listed in each:
+            lost = {h.effect.name for h in listed if not has_effect(self.first.problem.model, h.effect.name)}
+            gone = [h for h in model.named if h in listed or lost & set(h.effect.needs)]
+            kept = tuple(h for h in model.named if h not in gone)
+            names = frozenset(h.name for h in kept)
+            asked.append(names)
+            known, least = self.models.get(names), -np.inf
+            if names in model.nested:
+                least = model.nested[names].score - WORTH_A_STEP
+            if known is None or (known.score < least and (model.names, names) not in self.tried):
+                self.tried.add((model.names, names))
+                tasks[names] = partial(weighed_without, model, gone, self.first, self.motion, self.halves)
+        for names, found in zip(tasks, do_all(list(tasks.values()), self.loop.jobs), strict=True):
+            self.models[names] = max(self.models.get(names, found), found, key=SCORE)
+        return [self.models[names] for names in asked]
 
     def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
         """The most probable of some refits, and of them without an effect that they make superfluous; None without any.
@@ -352,7 +362,7 @@ class Found:
             if not every:
                 score, smaller = self.scores[best.names], self._smaller(best)
                 gone = tuple(h for h in best.named if smaller.get(best.names - {h.name}, -np.inf) > score)
-            least = self.most_probable(self.without([h]) for h in gone)
+            least = self.most_probable(self._without_each(([h] for h in gone), best))
             if least is None or not self.is_better(least):
                 return self.best is not whole
             self.best = least

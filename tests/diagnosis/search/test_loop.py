@@ -231,14 +231,16 @@ def test_something_nameless_is_weighed_where_no_further_effect_is_left_to_try(gu
     assert abs(tilt.parameters["x"].value - 0.02) < 3 * tilt.parameters["x"].sigma
 
 
-def test_beside_something_nameless_effects_are_found_from_one_linearisation(gusty, gusty_first):
+def test_beside_something_nameless_effects_are_found_about_the_path_of_a_model(gusty, gusty_first):
     """Its evidence, strengths, what is left without each, and a fit without patterns."""
     found = Found(gusty, gusty_first)
     nothing = found.best
     while found.round():
         pass
     found.compare()
-    (sets,) = found.sets
+    declared, sets = found.sets  # about the paths of the declared model and of the best one
+    assert declared.screen.model.names == {NAMELESS}
+    assert sets.screen.model.names >= {"frame_tilt", NAMELESS}
     best, weights = found.best, sets.weights
     assert {"frame_tilt", NAMELESS} <= best.names
     assert best.score > weights[frozenset([NAMELESS])].score + np.log(100.0)
@@ -248,6 +250,18 @@ def test_beside_something_nameless_effects_are_found_from_one_linearisation(gust
     tilt = best.strengths["frame_tilt"]
     assert (np.abs(tilt.mean - [0.02, 0.0]) < 3 * np.sqrt(np.diagonal(tilt.covariance))).all()
     assert found.plain(best).score > nothing.score  # its fit without patterns holds the effect too
+
+
+def test_beside_something_nameless_an_idle_effect_costs_no_more_than_its_prior(gusty, gusty_first):
+    """Weighed about the same path as nothing beside it: about another one, dozens of nats may lie between the two."""
+    catalogue = [EFFECTS[name] for name in ("frame_tilt", "restitution_speed")]
+    found = Found(replace(gusty, catalogue=catalogue, of_some=[]), gusty_first)
+    assert found.round()
+    assert found.best.names == {"frame_tilt"}
+    found.compare()
+    scores = found.scores
+    idle = scores[frozenset(["restitution_speed", NAMELESS])] - scores[frozenset([NAMELESS])]
+    assert -np.log(1000.0) < idle < 0.0
 
 
 def test_an_effect_keeps_the_form_about_which_its_strength_is_known(make_ball, make_launches, make_shots):
