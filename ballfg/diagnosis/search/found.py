@@ -110,11 +110,13 @@ class Found:
 
     def step(self) -> bool:
         """One round, or where none adds anything, removes effects without which a refit is better; False: neither."""
-        able = len(self.best.named) < MOST_EFFECTS and len(self.rounds) < self.begun + MOST_ROUNDS
-        return (able and self.round()) or self._pruned(every=True)
+        return (len(self.rounds) < self.begun + MOST_ROUNDS and self.round()) or self._pruned(every=True)
 
     def round(self) -> bool:
-        """Adds the effects that make the model most probable, and removes those that they make superfluous."""
+        """Adds the effects that make the model most probable, and removes those that they make superfluous.
+
+        Where none does, or as many as may be are there, one is exchanged for another.
+        """
         loop, best, number = self.loop, self.best, len(self.rounds) + 1
 
         def tell(line: str) -> None:
@@ -122,7 +124,7 @@ class Found:
 
         most = min(MOST_EFFECTS - len(best.named), self.together)
         scored, attempts, screen = try_hypotheses(best, self.motion, loop.catalogue, tell, most)
-        refits, winner = self._attempted(attempts, tell)
+        refits, winner = self._attempted(attempts if most else [], tell)
         scored = retested(scored, refits)
         if not self.is_better(winner):
             if self._refitted(best, screen):
@@ -132,7 +134,7 @@ class Found:
             if (exchanged := self._exchanged(screen, scored, tell)) is not None:
                 self.rounds.append(Round(scored, [*refits, exchanged], (exchanged.name,)))
                 return True
-        if not self.is_better(winner):
+        if most and not self.is_better(winner):
             more, attempts = try_varying(best, self.motion, loop.of_some or loop.catalogue, self.ways, tell)
             fitted, other = self._attempted(attempts, tell)
             scored, refits = [*scored, *more], [*refits, *fitted]
