@@ -79,7 +79,10 @@ class System:
         eliminate_each(rows, upper)
         left = rows[..., STATE_DIM:end]
         solved = np.linalg.solve(upper[..., :STATE_DIM], upper[..., STATE_DIM:end])
-        return Eliminated(np.asarray(solved), np.asarray(left.swapaxes(-1, -2) @ left))
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # about a path far off: what it gives is not finite and loses
+            return Eliminated(np.asarray(solved), np.asarray(left.swapaxes(-1, -2) @ left))
 
     def start_correction(self, residual: Array) -> Array:
         """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""

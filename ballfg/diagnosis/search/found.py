@@ -1,27 +1,23 @@
-"""All models that a search has weighed, the best of them, and the steps that lead to better ones."""
+"""The steps of a search: from the best model so far to more probable ones, by refits with other effects."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ballfg.arrays import Mask
-from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
-from ballfg.diagnosis.evidence.odds import ALIKE, Odds, foretold, odds_of, scores_of
-from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.nameless import NAMELESS
+from ballfg.diagnosis.evidence.odds import ALIKE, foretold
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.sets import Sets
-from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
+from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.changed_fits import model_of, smaller_fit, weighed_without
+from ballfg.diagnosis.search.changed_fits import smaller_fit
 from ballfg.diagnosis.search.evaluation import on_all, on_others
+from ballfg.diagnosis.search.models import WeighedModels
 from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
 from ballfg.diagnosis.search.trial import offered_varying, screen_of, try_hypotheses, try_varying
 from ballfg.dynamics.variation import place_of
@@ -38,7 +34,6 @@ AT_ONCE = 2
 """Number of attempts that are made side by side, whatever the number of processes: results do not depend on it."""
 MOST_EXCHANGES = 3
 """Largest number of exchanges that a round refits."""
-SCORE = attrgetter("score")
 
 
 @dataclass(frozen=True)
@@ -50,48 +45,14 @@ class Round:
     added: tuple[str, ...] = ()
 
 
-class Found:
-    """Everything weighed so far, by the names of the effects, and the best of it."""
+class Found(WeighedModels):
+    """The models of a search, and the rounds that led to them."""
 
     def __init__(self, loop: "SearchLoop", first: Fit) -> None:
+        super().__init__(on_all(first, on_others(first, loop.holdout.held_out)), loop.jobs)
         self.loop = loop
-        self.first = whole = on_all(first, on_others(first, loop.holdout.held_out))
-        self.halves: Mask = unlike_halves(whole)
-        self.motion = random_motion(whole)  # the same for all models: with another one they cannot be compared
-        self.best = weighed(whole, (), self.motion, self.halves)
-        self.models = {self.best.names: self.best}
         self.rounds: list[Round] = []
-        self.tried: set[tuple[frozenset[str], frozenset[str]]] = set()
         self.begun, self.together = 0, MOST_EFFECTS  # round with which a search began; effects that one may add
-        self.sets: list[Sets] = []  # beside something nameless, of each search that weighed it
-
-    @cached_property
-    def patterns(self) -> Patterns:
-        """Patterns without a name about the declared model's fit, the same for all models."""
-        return Patterns.of(self.models[frozenset()].fit)
-
-    @property
-    def odds(self) -> Odds:
-        """Probabilities over all models weighed so far."""
-        return odds_of(list(self.models.values()))
-
-    @property
-    def scores(self) -> dict[frozenset[str], float]:
-        """Logarithm of the odds of all models weighed or foretold so far."""
-        return scores_of(list(self.models.values()))
-
-    def most_probable(self, models: Iterable[Weighed]) -> Weighed | None:
-        """The best of some models weighed before; None without any."""
-        scores = self.scores
-        return max(models, key=lambda model: scores[model.names], default=None)
-
-    def is_better(self, model: Weighed | None, than: Weighed | None = None, by: float = 0.0) -> bool:
-        """Whether a model weighed before is more probable than another one, None: than the best one so far.
-
-        Args: by: least logarithm of their odds.
-        """
-        scores = self.scores
-        return model is not None and scores[model.names] > scores[(than or self.best).names] + by
 
     def search(self) -> None:
         """Adds, removes and exchanges effects as long as that makes the model more probable, then weighs the rest."""
@@ -201,45 +162,26 @@ class Found:
         alone takes the values that make up for what no effect describes.
         """
         loop, best = self.loop, self.best
-        if not best.neighbours:  # no round looked beyond it: it was the last, or as many effects as may be are there
+        if not best.neighbours:  # no round looked beyond it: it was the last
             loop.watch("weighing what could stand in place of its effects")
             neighbours = screen_of(best, self.motion, loop.catalogue).neighbours
             self.best = self.models[best.names] = replace(best, neighbours=neighbours)
         loop.watch("weighing what has no name")
         nothing = self.models[frozenset()]  # a name has to beat that at its best
-        beside = []
-        for model in {m.names: m for m in (nothing, self.best)}.values():
-            found = weighed(model.fit, model.named, self.motion, self.halves, model, self.patterns)
-            self.models[found.names] = found
-            beside.append(found)
+        about = {m.names: m for m in (nothing, self.best)}.values()
+        beside = [weighed(m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in about]
+        self.known(beside)
         scores = self.scores
         if NAMELESS not in max(scores, key=lambda names: scores[names]):
             return
         loop.watch("weighing sets of effects beside it")
         for model in beside:
             varying = offered_varying(model, loop.of_some or loop.catalogue, self.ways)
-            sets = Sets.near(screen_of(model, self.motion, loop.catalogue, varying, self.patterns), MOST_EFFECTS)
-            self.sets.append(sets)
-            self.models[model.names] = replace(model, neighbours=sets.weights)
+            screen = screen_of(model, self.motion, loop.catalogue, varying, self.patterns)
+            self.add(Sets.near(screen, MOST_EFFECTS))
         scores = self.scores
         names = max((*self.models, *(n for sets in self.sets for n in sets.members)), key=lambda names: scores[names])
-        self.best = self._model(names)
-
-    def _model(self, names: frozenset[str]) -> Weighed:
-        """A model weighed before, or that of a set of effects beside something nameless."""
-        if names not in self.models:
-            self.models[names] = model_of(self._sets_with(names), names, self.first)
-        return self.models[names]
-
-    def _sets_with(self, names: frozenset[str]) -> Sets:
-        """The sets among which one is the most probable; several searches may have come to it."""
-        return max((sets for sets in self.sets if names in sets.members), key=lambda sets: sets.score(names))
-
-    def rest(self, gone: Sequence[Hypothesis], model: Weighed) -> Weighed:
-        """A model without some of its effects, and without those that need them."""
-        if model.nameless and any(model.names in sets.members for sets in self.sets):
-            return self._model(self._sets_with(model.names).without(model.names, [h.name for h in gone]))
-        return self.without(gone, model)
+        self.best = self.model(names)
 
     @cached_property
     def ways(self) -> list[Grouping]:
@@ -260,58 +202,10 @@ class Found:
             now, waiting = waiting[:AT_ONCE], waiting[AT_ONCE:]
             for attempt in now:
                 tell(f"fitting with {attempt.words}")
-            made = do_all([task for attempt in now for task in attempt.refits], self.loop.jobs)
+            made = do_all([task for attempt in now for task in attempt.refits], self.jobs)
             refits += made
             winner = self.most_probable(w for w in (winner, self._weighed(made)) if w is not None)
         return sorted(refits, key=lambda r: r.delta_bic), winner
-
-    def named_at(self, probability: float) -> Weighed:
-        """The model with all effects that are at least so probable, or with most of them.
-
-        Of several that can hardly be told apart, the most probable one stands for all.
-        """
-        odds, best = self.odds, self.best.names
-        likely = {name for name in odds.effects() if odds.of(name) >= probability} | {NAMELESS}
-        if best in odds.models:
-            likely |= {h.name for h in self.best.named if odds.together(h.name, best) >= probability}
-        if gone := [h for h in self.best.named if h.name not in likely]:
-            self.rest(gone, self.best)
-            odds = self.odds
-        able = [model for model in self.models.values() if model.names <= likely]
-        return max(able, key=lambda model: (len(model.named), odds.models[model.names]))
-
-    def plain(self, model: Weighed) -> Weighed:
-        """The same model without something nameless."""
-        names = model.names - {NAMELESS}
-        if names not in self.models:
-            self.models[names] = weighed(model.fit, model.named, self.motion, self.halves, model)
-        return self.models[names]
-
-    def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
-        """A model without some of its effects, and without those that need them.
-
-        It is weighed again from there if the linearisation says that it was found in a poorer minimum before.
-        """
-        return self._without_each([gone], model or self.best)[0]
-
-    def _without_each(self, each: Iterable[Sequence[Hypothesis]], model: Weighed) -> list[Weighed]:
-        """The models without some effects or others, side by side."""
-        asked, tasks = list[frozenset[str]](), dict[frozenset[str], Callable[[], Weighed]]()
-        for listed in each:
-            lost = {h.effect.name for h in listed if not has_effect(self.first.problem.model, h.effect.name)}
-            gone = [h for h in model.named if h in listed or lost & set(h.effect.needs)]
-            kept = tuple(h for h in model.named if h not in gone)
-            names = frozenset(h.name for h in kept)
-            asked.append(names)
-            known, least = self.models.get(names), -np.inf
-            if names in model.nested:
-                least = model.nested[names].score - WORTH_A_STEP
-            if known is None or (known.score < least and (model.names, names) not in self.tried):
-                self.tried.add((model.names, names))
-                tasks[names] = partial(weighed_without, model, gone, self.first, self.motion, self.halves)
-        for names, found in zip(tasks, do_all(list(tasks.values()), self.loop.jobs), strict=True):
-            self.models[names] = max(self.models.get(names, found), found, key=SCORE)
-        return [self.models[names] for names in asked]
 
     def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
         """The most probable of some refits, and of them without an effect that they make superfluous; None without any.
@@ -324,7 +218,7 @@ class Found:
             for r in refits
             if np.isfinite(r.fit.cost)
         ]
-        found = self._known(do_all(tasks, self.loop.jobs))
+        found = self.known(do_all(tasks, self.jobs))
         scores = self.scores
         for model in list(found):
             smaller = self._smaller(model)
@@ -332,12 +226,6 @@ class Found:
             if smaller.get(names, -np.inf) > max(scores[model.names], scores[best.names]):
                 found.append(self.without([h for h in model.named if h.name not in names], model))
         return self.most_probable(self.models[model.names] for model in found)  # a smaller one may replace its refit
-
-    def _known(self, found: Sequence[Weighed]) -> list[Weighed]:
-        """Models with their effects in the best minimum of all that were found, each once; they count from now on."""
-        for model in found:
-            self.models[model.names] = max(self.models.get(model.names, model), model, key=SCORE)
-        return [self.models[names] for names in dict.fromkeys(model.names for model in found)]
 
     def _smaller(self, model: Weighed) -> dict[frozenset[str], float]:
         """Logarithm of the odds of the models that a model holds, by their names.
@@ -364,7 +252,7 @@ class Found:
             if not every:
                 score, smaller = self.scores[best.names], self._smaller(best)
                 gone = tuple(h for h in best.named if smaller.get(best.names - {h.name}, -np.inf) > score)
-            least = self.most_probable(self._without_each(([h] for h in gone), best))
+            least = self.most_probable(self.without_each(([h] for h in gone), best))
             if least is None or not self.is_better(least):
                 return self.best is not whole
             self.best = least

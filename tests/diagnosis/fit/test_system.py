@@ -53,6 +53,15 @@ def test_a_number_of_which_no_sample_tells_stays(system):
     assert (lost.eliminated().start_step(np.ones(Q + P))[1, :6] == 0.0).all()
 
 
+def test_about_a_path_far_off_squares_overflow_without_a_warning(system):
+    """A refit may try one: what its system gives is not finite, and it loses."""
+    by_common = system.by_common.copy()
+    by_common[1, :, 0] *= 1e200
+    far = System(system.residual, system.by_start, by_common).eliminated()
+    assert np.isinf(far.gram[1, 0, 0])
+    np.testing.assert_array_equal(far.gram[[0, 2, 3, 4]], system.eliminated().gram[[0, 2, 3, 4]])
+
+
 @pytest.mark.parametrize("damping", [0.0, 0.3])
 def test_the_step_is_that_of_the_dense_normal_equations(system, damping):
     states, common, residual = stacked(system)

@@ -332,7 +332,7 @@ def test_the_best_minimum_of_the_same_effects_counts(gusty, gusty_first):
     (better,) = found.models.values()
     poorer = replace(better, evidence=better.evidence - 100.0)
     for models in ([poorer, better], [better, poorer]):
-        assert found._known(models) == [better]
+        assert found.known(models) == [better]
     assert found.models == {frozenset(): better}
 
 
