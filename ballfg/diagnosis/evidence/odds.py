@@ -92,10 +92,12 @@ def foretold(
 ) -> dict[frozenset[str], float]:
     """Logarithm of the odds of others by their names, as the linearisation of a model foretells them.
 
+    Beside patterns sets are compared among themselves: which ones were also weighed without patterns is chance.
+
     Args: scores, weighed: of the models that were weighed and have an evidence.
     """
-    lost = scores[model.names] - model.score
-    return {n: min(lost + w.score, tempered(n, w, weighed) + w.odds) for n, w in others.items()}
+    lost, known = scores[model.names] - model.score, others if NAMELESS in model.names else weighed
+    return {n: min(lost + w.score, tempered(n, w, known) + w.odds) for n, w in others.items()}
 
 
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:

@@ -190,6 +190,17 @@ def test_neighbours_that_no_refit_weighed_count_as_foretold():
     assert odds.of("frame_tilt") < 0.01
 
 
+def test_which_sets_were_weighed_without_patterns_too_does_not_decide_beside_them():
+    """The wind was, and its gain beside patterns is not borne out over that; nobody knows of the scale's."""
+    nothing, wind = model([], 0.0), model(["wind"], 10.0, np.full(10, 6.9))
+    patterns, *sets = (model(names, evidence) for names, evidence in (([], 50.0), (["wind"], 70.0), (["scale"], 70.0)))
+    for one in (patterns, *sets):
+        one.names |= {NAMELESS}
+    patterns.neighbours = {one.names: one for one in (patterns, *sets)}
+    odds = odds_of([nothing, wind, patterns])
+    assert [odds.of(name) for name in ("wind", "scale")] == pytest.approx([0.5, 0.5], abs=1e-6)
+
+
 def test_effects_that_cannot_be_told_apart_are_there_together():
     """Of two that explain the same neither is sure, one of them is."""
     nothing = model([], 0.0)
