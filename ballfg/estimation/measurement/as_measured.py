@@ -94,11 +94,18 @@ class LabelMap:
             )
         return cls(columns.T, offset)
 
-    def spin(self, label: Array) -> Array:
-        """(3,) rad/s, the spin of a label (3,) rad/s."""
-        return np.asarray(np.linalg.solve(self.matrix, label - self.offset))
+    def spin(self, label: Array, noise: float, prior: float) -> Array:
+        """(3,) rad/s, the spin of a label (3,) rad/s, as far as the label says more of it than the prior.
 
-    @property
-    def gain(self) -> float:
-        """Mean factor between the lengths of labels and spins over all directions."""
-        return float(abs(np.linalg.det(self.matrix)) ** (1.0 / 3.0))
+        A label that hardly shows one direction of the spin would stand for thousands of rad/s along it.
+
+        Args: noise: rad/s, of the label.  prior: rad/s, of any spin, about zero.
+        """
+        left, sizes, right = np.linalg.svd(self.matrix)
+        along = np.where(noise < prior * sizes, left.T @ (label - self.offset) / sizes, 0.0)
+        return np.asarray(right.T @ along)
+
+    def spread(self, noise: float, prior: float) -> float:
+        """Standard deviation of that spin, rad/s, the geometric mean over all directions.  Args: as of `spin`."""
+        sizes = np.linalg.svd(self.matrix, compute_uv=False)
+        return float(np.prod(np.minimum(noise / sizes, prior)) ** (1.0 / 3.0))

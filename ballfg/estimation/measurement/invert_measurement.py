@@ -19,7 +19,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement import as_measured
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import WIDEST_PRIOR, Settings, sample_sigmas
+from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.smoother import PiecewiseSmoother, Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
@@ -68,8 +68,7 @@ class InvertMeasurement(Estimator):
     def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings) -> None:
         super().__init__(model, surfaces, settings)
         self.labels = as_measured.LabelMap.of(model)
-        # labels that hold almost nothing of the spin say as little as may be
-        own = replace(settings, spin_label_noise=min(settings.spin_label_noise / self.labels.gain, WIDEST_PRIOR))
+        own = replace(settings, spin_label_noise=self.labels.spread(settings.spin_label_noise, settings.spin_prior))
         plain = as_measured.plainly_measured(model)
         self.smoother = PiecewiseSmoother(plain, self.surfaces, own)
         self.inner = self.smoother if kind in (Smoother, PiecewiseSmoother) else kind(plain, self.surfaces, own)
@@ -120,7 +119,7 @@ class InvertMeasurement(Estimator):
         """The track with its true stamps and spin label; without a label that stands for a spin of no ball."""
         labels = track.labels
         if track.spin_label is not None:
-            spin = self.labels.spin(track.spin_label)
+            spin = self.labels.spin(track.spin_label, self.settings.spin_label_noise, self.settings.spin_prior)
             labels = {name: value for name, value in labels.items() if name not in SPIN_LABELS}
             if np.abs(spin).max() <= FASTEST_SPIN:
                 labels |= dict(zip(SPIN_LABELS, spin.tolist(), strict=True))

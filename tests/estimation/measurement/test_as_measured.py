@@ -123,7 +123,7 @@ def test_labels_are_solved_for() -> None:
                       spin_label_offset={"x": 20.0, "z": -5.0}, spin_label_scale={"s": 0.3})  # fmt: skip
     label = model.labelled(torch.from_numpy(spin)).detach().numpy()
     assert np.abs(label - spin).max() > 50.0
-    np.testing.assert_allclose(LabelMap.of(model).spin(label), spin, rtol=1e-12)
+    np.testing.assert_allclose(LabelMap.of(model).spin(label, 5.0, 300.0), spin, rtol=1e-12)
 
 
 @pytest.mark.parametrize("number", [0, 7, 20, 47])
@@ -131,8 +131,18 @@ def test_exchanged_axes_leave_the_noise_alone(number) -> None:
     matrix = signed_permutations()[number].numpy()
     labels = LabelMap.of(measuring(spin_label_frame=frame(matrix)))
     np.testing.assert_array_equal(labels.matrix, matrix)
-    assert labels.gain == 1.0
-    assert LabelMap.of(measuring(spin_label_scale={"s": 0.25})).gain == pytest.approx(1.25, rel=1e-12)
+    assert labels.spread(5.0, 300.0) == pytest.approx(5.0, rel=1e-12)
+    assert LabelMap.of(measuring(spin_label_scale={"s": 0.25})).spread(5.0, 300.0) == pytest.approx(4.0, rel=1e-12)
+
+
+def test_a_label_that_hardly_shows_a_direction_leaves_it_to_the_prior():
+    """Solved for, 6 rad/s of noise would be 600 rad/s of spin; turned axes of labels change nothing."""
+    turn = signed_permutations()[20].numpy()
+    labels = LabelMap.of(measuring(spin_label_frame=frame(turn @ np.diag([1.0, 0.5, 0.01]))))
+    spin = labels.spin(turn @ np.array([50.0, -20.0, 6.0]), 5.0, 300.0)
+    np.testing.assert_allclose(spin, [50.0, -40.0, 0.0], atol=1e-9)
+    assert labels.spread(5.0, 300.0) == pytest.approx((5.0 * 10.0 * 300.0) ** (1.0 / 3.0), rel=1e-12)
+    np.testing.assert_allclose(labels.spin(turn @ np.array([50.0, -20.0, 6.0]), 5.0, 600.0)[2], 600.0, rtol=1e-9)
 
 
 def test_labels_that_tell_no_spin_are_refused() -> None:
