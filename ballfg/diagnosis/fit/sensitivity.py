@@ -1,6 +1,7 @@
 """Predicts samples, and differentiates them by first states and coefficients.
 
-Derivatives are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
+Motion in machine code has its derivatives there, and the chain rule gives those of what the instrument writes. Others
+are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
 """
 
 from collections.abc import Callable, Mapping, Sequence
