@@ -15,6 +15,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM
 
 _MEASUREMENT = "measurement"  # Attribute of an `AnalyticModel` that holds its measurement effects
+ROUNDING = 1e-9  # Share by which singular values that are equal may differ
 LARGEST_CONDITION = 1e6
 """Largest condition of the map from spins to labels: beyond it a label leaves a component of the spin undetermined."""
 
@@ -95,17 +96,21 @@ class LabelMap:
         return cls(columns.T, offset)
 
     def spin(self, label: Array, noise: float, prior: float) -> Array:
-        """(3,) rad/s, the spin of a label (3,) rad/s, as far as the label says more of it than the prior.
+        """(3,) rad/s, the spin of a label (3,) rad/s, as far as the label tells it.
 
         A label that hardly shows one direction of the spin would stand for thousands of rad/s along it.
 
         Args: noise: rad/s, of the label.  prior: rad/s, of any spin, about zero.
         """
         left, sizes, right = np.linalg.svd(self.matrix)
-        along = np.where(noise < prior * sizes, left.T @ (label - self.offset) / sizes, 0.0)
-        return np.asarray(right.T @ along)
+        told = noise / sizes <= self._most(noise, prior)
+        return np.asarray(right.T @ np.where(told, left.T @ (label - self.offset) / sizes, 0.0))
 
     def spread(self, noise: float, prior: float) -> float:
-        """Standard deviation of that spin, rad/s, the geometric mean over all directions.  Args: as of `spin`."""
-        sizes = np.linalg.svd(self.matrix, compute_uv=False)
-        return float(np.prod(np.minimum(noise / sizes, prior)) ** (1.0 / 3.0))
+        """Standard deviation of that spin, rad/s, root mean square over all directions.  Args: as of `spin`."""
+        sigmas = noise / np.linalg.svd(self.matrix, compute_uv=False)
+        return float(np.sqrt((np.minimum(sigmas, self._most(noise, prior)) ** 2).mean()))
+
+    def _most(self, noise: float, prior: float) -> float:
+        """Largest standard deviation of a direction that a label tells: its best one it tells in any case."""
+        return max(prior, noise / float(np.linalg.norm(self.matrix, 2)) * (1.0 + ROUNDING))

@@ -19,7 +19,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement import as_measured
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import Settings, sample_sigmas
+from ballfg.estimation.settings import WIDEST_PRIOR, Settings, sample_sigmas
 from ballfg.estimation.smoother.smoother import PiecewiseSmoother, Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
@@ -68,7 +68,9 @@ class InvertMeasurement(Estimator):
     def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings) -> None:
         super().__init__(model, surfaces, settings)
         self.labels = as_measured.LabelMap.of(model)
-        own = replace(settings, spin_label_noise=self.labels.spread(settings.spin_label_noise, settings.spin_prior))
+        # labels that hold almost nothing of the spin say as little as may be
+        spread = min(self.labels.spread(settings.spin_label_noise, settings.spin_prior), WIDEST_PRIOR)
+        own = replace(settings, spin_label_noise=spread)
         plain = as_measured.plainly_measured(model)
         self.smoother = PiecewiseSmoother(plain, self.surfaces, own)
         self.inner = self.smoother if kind in (Smoother, PiecewiseSmoother) else kind(plain, self.surfaces, own)

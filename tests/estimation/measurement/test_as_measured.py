@@ -141,8 +141,11 @@ def test_a_label_that_hardly_shows_a_direction_leaves_it_to_the_prior():
     labels = LabelMap.of(measuring(spin_label_frame=frame(turn @ np.diag([1.0, 0.5, 0.01]))))
     spin = labels.spin(turn @ np.array([50.0, -20.0, 6.0]), 5.0, 300.0)
     np.testing.assert_allclose(spin, [50.0, -40.0, 0.0], atol=1e-9)
-    assert labels.spread(5.0, 300.0) == pytest.approx((5.0 * 10.0 * 300.0) ** (1.0 / 3.0), rel=1e-12)
+    assert labels.spread(5.0, 300.0) == pytest.approx(np.sqrt((5.0**2 + 10.0**2 + 300.0**2) / 3.0), rel=1e-12)
     np.testing.assert_allclose(labels.spin(turn @ np.array([50.0, -20.0, 6.0]), 5.0, 600.0)[2], 600.0, rtol=1e-9)
+    noisy = LabelMap.of(measuring(spin_label_frame=frame(turn)))
+    np.testing.assert_allclose(noisy.spin(turn @ np.array([50.0, -20.0, 6.0]), 300.0, 200.0), [50.0, -20.0, 6.0])
+    assert noisy.spread(300.0, 200.0) == pytest.approx(300.0, rel=1e-8)
 
 
 def test_labels_that_tell_no_spin_are_refused() -> None:
