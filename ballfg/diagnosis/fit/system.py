@@ -79,9 +79,8 @@ class System:
         eliminate_each(rows, upper)
         left = rows[..., STATE_DIM:end]
         solved = np.linalg.solve(upper[..., :STATE_DIM], upper[..., STATE_DIM:end])
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # about a path far off: what it gives is not finite and loses
+        # about a path far off squares overflow: what it gives is not finite and loses
+        with np.errstate(over="ignore", invalid="ignore"):
             return Eliminated(np.asarray(solved), np.asarray(left.swapaxes(-1, -2) @ left))
 
     def start_correction(self, residual: Array) -> Array:
