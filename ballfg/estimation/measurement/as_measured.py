@@ -112,5 +112,5 @@ class LabelMap:
         return float(np.sqrt((np.minimum(sigmas, self._most(noise, prior)) ** 2).mean()))
 
     def _most(self, noise: float, prior: float) -> float:
-        """Largest standard deviation of a direction that a label tells: the prior's, or its best direction's if larger."""
+        """Largest standard deviation of a direction that a label tells: the prior's, or its best direction's."""
         return max(prior, noise / float(np.linalg.norm(self.matrix, 2)) * (1.0 + ROUNDING))
