@@ -290,9 +290,7 @@ class Online(Estimator):
         again = explain(window, self._samples, self.events) if changed else []
         if self.settings.stamp_jitter > 0.0 and sample.measured:
             tell_velocities(window, self._samples)
-        if again:
-            self._append(window, *again)
-        update = self._append(window, sample)
+        update = self._append(window, *again, sample)
         moved = move_contacts(window, self._samples, self.events)
         if moved:
             self._append(window, *moved)

@@ -88,14 +88,18 @@ class ChainWindow(StreamWindow):
 
     def retract(self, count: int) -> None:
         """Removes the newest samples, with their states and factors."""
-        self._relinearize(None)
         for held in (self.samples, self._priors, self._positions, self._answers, self._rows):
             del held[count:]
         del self.intervals[count - 1 :]
         self.theta, self._stale = self.theta[:count], {k: new for k, new in self._stale.items() if k < count}
         self._answers[-1] = [answer for answer in self._answers[-1] if not isinstance(answer[0], DynamicsFactors)]
         self._renew([count - 1], moved=False)
-        self._solve()
+
+    def append_all(self, samples: Sequence[Sample]) -> Update:
+        """As the base's, after what was retracted or weighed anew."""
+        if self._stale:
+            self._solve()
+        return super().append_all(samples)
 
     def attach(self, measurement: Measurement) -> Update:
         """Adds one more measurement of the newest sample, which holds it already."""
@@ -108,18 +112,13 @@ class ChainWindow(StreamWindow):
 
     def reweigh(self, numbers: list[int]) -> None:
         """Replaces the position factors of some samples of the window, whose noise has changed."""
-        self._relinearize(None)
         for k in numbers:
             self._positions[k] = self._measured(k)
         self._renew(numbers, moved=False)
-        self._solve()
 
     def shorten(self, keep: int) -> None:
         """Drops all but the newest states; the triangle at the cut keeps their information."""
         leaving = len(self.samples) - keep
-        self._relinearize(None)
-        if self._stale:
-            self._solve()
         w, p, linked = self.width, self.p, self.intervals[leaving - 1] is not None
         carries, shared, _ = self._chain
         known = np.concatenate((carries[leaving] if linked else carries[leaving, :0], shared[leaving]))

@@ -102,21 +102,39 @@ class IsamWindow(StreamWindow):
         return linear_factor([STATE_KEY + state], [block[0]], -residual)
 
     def _update(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: dict[int, int]
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        remove: list[int],
+        last: dict[int, int],
+        held: Sequence[int] = (),
     ) -> list[int]:
         """One iSAM2 update; keys in `last` are eliminated after all others, by group; empty: GTSAM's order.
+
+        The linearisation points of the keys in `held` stay, whatever the thresholds say.
 
         By itself GTSAM eliminates the newest states last, but not the coefficients: every state would then depend on
         them from below, and no update would be local.
         """
+        how = gtsam.ISAM2UpdateParams()
+        how.removeFactorIndices = remove
         if last:
             groups = gtsam.KeyGroupMap()
             for key, group in last.items():
                 groups.insert2(key, group)
-            self._result = self.isam.update(graph, values, remove, groups)
-        else:
-            self._result = self.isam.update(graph, values, remove)
+            how.constrainedKeys = groups
+        if held:
+            staying = gtsam.KeyList()
+            for key in held:
+                staying.push_back(key)
+            how.noRelinKeys = staying
+        self._result = self.isam.update(graph, values, how)
         return list(self._result.getNewFactorsIndices())
+
+    def _keys(self) -> list[int]:
+        """GTSAM's keys of all variables."""
+        first = STATE_KEY + self.first
+        return [*range(first, first + len(self.theta)), *[COEFFICIENT_KEY] * (self.p > 0)]
 
     def _read_back(self) -> None:
         """The linear solution of all states, and the newest one's covariance."""
@@ -147,10 +165,9 @@ class IsamWindow(StreamWindow):
         """Removes the newest samples, with their states and factors, from iSAM2 as well."""
         gone, n = range(count, len(self.samples)), len(self.samples)
         slots = self._slots(gone, range(count - 1, n - 1), gone)
-        self._relinearize(None)
         del self.samples[count:], self.intervals[count - 1 :]
-        self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {})
         self.theta = self.theta[:count]
+        self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {}, self._keys())
         self._read_back()
 
     def attach(self, measurement: Measurement) -> Update:
@@ -170,12 +187,11 @@ class IsamWindow(StreamWindow):
 
     def reweigh(self, numbers: list[int]) -> None:
         """Replaces the position factors of some samples of the window, whose noise has changed."""
-        self._relinearize(None)
         graph, old = gtsam.NonlinearFactorGraph(), []
         for k in numbers:
             graph.push_back(self._position_factor(self.samples[k], self.first + k))
             old.append(self.samples[k].slots[0])
-        slots = self._update(graph, gtsam.Values(), old, {})
+        slots = self._update(graph, gtsam.Values(), old, {}, self._keys())
         for k, slot in zip(numbers, slots, strict=True):
             self.samples[k].slots = (slot, *self.samples[k].slots[1:])
         self._read_back()
@@ -190,7 +206,6 @@ class IsamWindow(StreamWindow):
         Raises: RuntimeError: from GTSAM, when the removed part is singular.
         """
         leaving = len(self.samples) - keep
-        self._relinearize(None)
         before = self.first, self.samples, self.intervals, self.theta, self.delta, self.shared
         linked = self.intervals[leaving - 1] is not None
         try:
