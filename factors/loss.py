@@ -1,7 +1,8 @@
 """Robust losses reduce the weight of large whitened residuals; they equal GTSAM's m-estimators."""
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 import torch
@@ -9,12 +10,26 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_number
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, REAL
 
 if TYPE_CHECKING:
     import gtsam
 
 LEAST_STRETCH = 0.05
 """Least curvature along the residual, for a finite step where the loss is straight or concave."""
+
+
+NAMES: Final = ("squared", "huber", "cauchy")
+SQUARED, HUBER, CAUCHY = range(len(NAMES))  # Their numbers in machine code
+
+
+@machine_code(REAL(COUNT, REAL, REAL))
+def weight_of(kind: int, scale: float, square: float) -> float:
+    """`Loss.weight` for machine code, of a squared whitened norm; the loss by its number in `NAMES`."""
+    if kind == HUBER:
+        return scale / max(math.sqrt(square), scale)
+    return 1.0 / (1.0 + square / (scale * scale)) if kind == CAUCHY else 1.0
 
 
 @dataclass(frozen=True)
@@ -32,8 +47,13 @@ class Loss:
     scale: float = 3.0
 
     def __post_init__(self) -> None:
-        check_choice("loss", self.name, ("squared", "huber", "cauchy"))
+        check_choice("loss", self.name, NAMES)
         check_number("scale", self.scale, "standard deviations", above=0.0)
+
+    @property
+    def kind(self) -> int:
+        """The number of the loss in `NAMES`."""
+        return NAMES.index(self.name)
 
     @property
     def convex(self) -> "Loss":

@@ -41,8 +41,12 @@ def _predict(transition, offset, decay, kicks, process, memory, m, p, work):
 
 
 @machine_code(REAL(COUNT, ONE, TWO, ONE, TWO, TWO, TWO, ONE, ONE))
-def _innovate(d, m, p, error, measured, seen, root, new, weighted):
+def innovate(d, m, p, error, measured, seen, root, new, weighted):
     """Squared whitened innovation of a sample; NaN if the innovation's covariance S is not positive definite.
+
+    Args:
+        d: place of the bias in the mean m (w,), which is measured with the position; w if there is none.
+        p: (w, w).  error: (3,) m, the sample, about the same origin as the mean.  measured: (3, 3), of its white error.
 
     Writes: seen (w, 3) = P H', root (3, 3), the inverse of that of S, new (3,), the whitened innovation, and
     weighted (3,), the innovation over S.
@@ -70,7 +74,7 @@ def _innovate(d, m, p, error, measured, seen, root, new, weighted):
 
 
 @machine_code(NOTHING(TWO, TWO, ONE, ONE, TWO, TWO))
-def _update(seen, root, new, m, p, gain):
+def update(seen, root, new, m, p, gain):
     """Updates with a sample whose whitened innovation is `new`; writes its gain (w, 3)."""
     w = len(m)
     whitened = np.zeros((3, w))
@@ -146,7 +150,7 @@ def filter_tracks(
                 offset, kick = offsets[t, k - 1], kicks[t, k - 1]
                 _predict(transitions[t, k - 1], offset, decays[t, k - 1], kick, process[t], memory[t], m, p, work)
             root, gain = roots[t, k], gains[t, k]
-            square = _innovate(d, m, p, errors[t, k], measured[t, k], seen, root, new, weighted[t, k])
+            square = innovate(d, m, p, errors[t, k], measured[t, k], seen, root, new, weighted[t, k])
             if math.isnan(square):
                 return False
             nis[t, k], gain[:] = square, 0.0
@@ -157,7 +161,7 @@ def filter_tracks(
             if used[t, k]:
                 prior = covariances[t, k]
                 prior[:] = p
-                _update(seen, root, new, m, p, gain)
+                update(seen, root, new, m, p, gain)
                 if k == 0:
                     _join(d, gain, prior, measured[t, k], p, work)
             means[t, k], covariances[t, k] = m, p

@@ -9,7 +9,7 @@ import torch
 
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.online.online import Online
-from ballfg.estimation.online.windows.interval import carried_with_bias
+from ballfg.estimation.online.windows.window_filter import carried_with_bias
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother

@@ -17,14 +17,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
-from ballfg.estimation.online.windows.interval import (
-    Interval,
-    IntervalMaker,
-    WindowFilter,
-    evaluate,
-    store,
-    without_bias,
-)
+from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store, without_bias
+from ballfg.estimation.online.windows.window_filter import WindowFilter
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
 from ballfg.factors.batch import FactorBatch, Values
