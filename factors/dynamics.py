@@ -144,13 +144,18 @@ class DynamicsFactors(FactorBatch):
         """(k, c) m, the surfaces of c contacts in some of the intervals."""
         return np.empty((len(self.dt[rows]), 0))
 
+    def moved(self, start: Array, rows: Index | slice) -> tuple[Array, Array]:
+        """As `propagate`, of arrays; by machine code once `prepared`."""
+        if self._moving is None:
+            after, jacobian = self.propagate(torch.from_numpy(start), rows)
+            return plain(after.cpu().numpy()), plain(jacobian.cpu().numpy())
+        after, jacobian, _ = self._moving.travel(plain(self.dt[rows]), self._levels(rows), start)
+        return after, jacobian
+
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9), (k, 9, 9) and, with coefficients, (k, 9, p)."""
         start = inputs[0] if len(inputs) == 2 else np.concatenate((inputs[0], inputs[2][:, : self.width]), axis=-1)
-        if self._moving is None:
-            after, jacobian = (plain(tensor.cpu().numpy()) for tensor in self.propagate(self._tensor(start), rows))
-        else:
-            after, jacobian, _ = self._moving.travel(plain(self.dt[rows]), self._levels(rows), plain(start))
+        after, jacobian = self.moved(plain(start), rows)
         root = self.whitening[rows]
         residual, by_start = whiten(root, plain(inputs[1]), after, jacobian)
         if len(inputs) == 2:

@@ -5,7 +5,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.flight import white_acceleration
@@ -50,7 +49,7 @@ class IntervalMaker:
         self.noise = noise
         covariance = noise.flight(np.ones(1))
         scale = np.sqrt(np.diagonal(covariance[0]))
-        self._template = FlightFactors(model, np.zeros(1, dtype=np.int64), np.ones(1), covariance)
+        self._template = FlightFactors(model, np.zeros(1, dtype=np.int64), np.ones(1), covariance).prepared()
         self._root = self._template.whitening * scale
         self._correlation = covariance[0] / (scale[:, None] * scale)
 
@@ -67,7 +66,7 @@ class IntervalMaker:
             batch = RestFactors(self.model, states, duration, covariance, np.array([motion.rest]))
         else:
             batch = FlightFactors(self.model, states, duration, covariance)
-        return Interval(batch, motion, covariance[0])
+        return Interval(batch.prepared(), motion, covariance[0])
 
     def _flight(self, index: int, dt: float) -> Interval:
         scale = np.empty(STATE_DIM)
@@ -99,8 +98,8 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
         batch = merge([intervals[k].batch for k in members])
         point = np.empty((len(members), STATE_DIM + len(coefficients)))
         point[:, :STATE_DIM], point[:, STATE_DIM:] = start[members, :STATE_DIM], coefficients
-        moved, jacobian = batch.propagate(torch.from_numpy(point), slice(None))
-        pieces = np.concatenate((moved.numpy()[:, :STATE_DIM, None], jacobian.numpy()[:, :STATE_DIM]), axis=2)
+        moved, jacobian = batch.moved(point, slice(None))
+        pieces = np.concatenate((moved[:, :STATE_DIM, None], jacobian[:, :STATE_DIM]), axis=2)
         for row, k in enumerate(members):
             result[k] = pieces[row]
         ended = [k for k in members if k < len(after)]  # the first ones: members ascend

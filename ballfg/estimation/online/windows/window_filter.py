@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, ONE, REAL, TWO
 from ballfg.estimation.noise.filter_code import innovate, update
@@ -54,6 +54,7 @@ class WindowFilter:
         if self.biased:
             dt = float(interval.batch.dt[0])
             carried, noise = carried_with_bias(piece, noise, point[STATE_DIM:], dt, self.settings)
+        covariance = plain(covariance)  # GTSAM's has its columns one behind another
         after, spread = np.empty_like(mean), np.empty_like(covariance)
         _predict(carried, noise, point, shared, mean, covariance, after, spread)
         if np.trace(spread[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
