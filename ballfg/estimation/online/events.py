@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.filters.window_velocity import window_velocities
+from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.segmentation.batch import BREAKS, SIDE, assembled
@@ -202,12 +202,13 @@ def tell_velocities(window: StreamWindow, samples: Sequence[Sample]) -> None:
     A start or a hit just before the window's last sample left its velocity undetermined; now there are more samples.
     """
     held = len(window)
-    times, positions = path_of(samples)
-    breaks = [k - 1 for k, s in enumerate(samples) if k and s.motion != FLIGHT]
-    velocities = window_velocities(times, positions, breaks)
+    first = max(held - 1 - WINDOW, 0)  # no line reaches further back
+    near = samples[first:]
+    breaks = [k - 1 for k, sample in enumerate(near) if k and sample.motion != FLIGHT]
+    velocities = window_velocities(*path_of(near), breaks)
     last = samples[max(held - 1, 0)].motion
-    begins = held > 0 and (held == 1 or last.hit or not last.linked) and held - 1 not in breaks
+    begins = held > 0 and (held == 1 or last.hit or not last.linked) and held - 1 - first not in breaks
     for k in range(held - begins, len(samples)):
-        samples[k].velocity = velocities[k]
+        samples[k].velocity = velocities[k - first]
     if begins:
         window.reweigh([held - 1])

@@ -17,6 +17,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.online.windows.linear import LinearFactors
+from ballfg.estimation.online.windows.rows import LinearRows, write_factor
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.correlated_noise import BiasFactors, BiasStartFactors
@@ -25,7 +26,6 @@ from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.linear.elimination import Root, eliminate_on, padded
 from ballfg.factors.linear.substitution import solution_of
 from ballfg.factors.prior import coefficient_prior
-from ballfg.state import STATE_DIM
 
 Answer = tuple[Array, tuple[Array, ...]]
 """Residuals and Jacobians, whitened."""
@@ -39,7 +39,8 @@ class ChainWindow(StreamWindow):
         super()._clear()
         self._columns = padded(2 * self.width + self.p + 1)
         self._priors: list[list[FactorBatch]] = []  # of each state, and of its tracker's bias
-        self._positions: list[list[FactorBatch]] = []  # of each state that was measured
+        self._linear: list[LinearRows | None] = []  # of each state; None where they are to be made
+        self._links: list[LinearRows] = []  # of each interval, between the tracker's biases, if there are any
         self._rows: list[Array] = []  # of each state: (r, columns) of all factors of which it is the first state
         self._room(0)
         self._answers: list[list[tuple[FactorBatch, Answer]]] = []  # of each: measurements and the interval after it
@@ -62,7 +63,7 @@ class ChainWindow(StreamWindow):
         other = copy.copy(self)
         other.samples, other.intervals = list(samples), [copy.copy(interval) for interval in self.intervals]
         other._priors, other._rows = [list(batches) for batches in self._priors], list(self._rows)
-        other._positions, other._answers = list(self._positions), list(self._answers)
+        other._linear, other._links, other._answers = list(self._linear), list(self._links), list(self._answers)
         other._stale = dict(self._stale)
         other._room(len(self.samples))
         return other
@@ -77,20 +78,22 @@ class ChainWindow(StreamWindow):
                 own.append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
             if self.samples:
                 self.intervals.append(arrival.interval)
+                if self.biased:
+                    self._links.append(self._link(sample.time - self.samples[-1].time))
             self.samples.append(sample)
             self._priors.append(own)
             self._rows.append(np.empty((0, self._columns)))
             self._answers.append([])
-            self._positions.append(self._measured(len(self.samples) - 1))
+            self._linear.append(None)
         self.theta = np.concatenate((self.theta, np.array([arrival.state for arrival in arrivals])))
         self._renew(range(first, len(self.samples)))
         return self._solve()
 
     def retract(self, count: int) -> None:
         """Removes the newest samples, with their states and factors."""
-        for held in (self.samples, self._priors, self._positions, self._answers, self._rows):
+        for held in (self.samples, self._priors, self._linear, self._answers, self._rows):
             del held[count:]
-        del self.intervals[count - 1 :]
+        del self.intervals[count - 1 :], self._links[count - 1 :]
         self.theta, self._stale = self.theta[:count], {k: new for k, new in self._stale.items() if k < count}
         self._answers[-1] = [answer for answer in self._answers[-1] if not isinstance(answer[0], DynamicsFactors)]
         self._renew([count - 1], moved=False)
@@ -113,7 +116,7 @@ class ChainWindow(StreamWindow):
     def reweigh(self, numbers: list[int]) -> None:
         """Replaces the position factors of some samples of the window, whose noise has changed."""
         for k in numbers:
-            self._positions[k] = self._measured(k)
+            self._linear[k] = None
         self._renew(numbers, moved=False)
 
     def shorten(self, keep: int) -> None:
@@ -127,7 +130,8 @@ class ChainWindow(StreamWindow):
         self._summary = LinearFactors([0, COEFFICIENTS], points, blocks, known[:, -1], self.biased)
         self.first += leaving
         self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
-        self._priors, self._positions = self._priors[leaving:], self._positions[leaving:]
+        self._priors, self._linear = self._priors[leaving:], [None, *self._linear[leaving + 1 :]]
+        self._links = self._links[leaving:]
         self._rows, self._answers = self._rows[leaving:], self._answers[leaving:]
         self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
         if self.biased and not linked:
@@ -183,40 +187,40 @@ class ChainWindow(StreamWindow):
             asked += [] if interval is None else [(interval.batch, interval.bridge)]
             kept = [(batch, *bridge.kept(0)) for batch, bridge in asked]
             self._answers[k] = [(batch, (r[None], tuple([b[None] for b in blocks]))) for batch, r, blocks in kept]
-        pieces = list(self._answers[k])
-        for batch in (*self._positions[k], *self._priors[k]):
-            pieces.append((batch, batch.compute(slice(None), (self._seen(batch, k),))))
-        if self.biased and k + 1 < len(self.samples):
-            dt = np.array([self.samples[k + 1].time - sample.time])
-            link = BiasFactors(np.array([k]), dt, self.settings.bias_sigmas, self.settings.memory_time)
-            pieces.append((link, link.compute(slice(None), (self._seen(link, k), self._seen(link, k + 1)))))
-        if k == 0 and self._summary is not None:
-            points = (self.theta[:1], self.coefficient_theta[None])
-            pieces.append((self._summary, self._summary.compute(slice(None), points)))
-        elif k == 0 and self.p:
-            prior = coefficient_prior(self._own_means, self._own_sigmas)
-            pieces.append((prior, prior.compute(slice(None), (self.coefficient_theta[None],))))
-        written = np.zeros((sum(batch.dim for batch, _ in pieces), self._columns))
-        row = 0
-        for batch, (residual, blocks) in pieces:
-            weight, end, place = 1.0, row + batch.dim, 0
+        own = self._linear[k] = self._linear[k] or self._linear_rows(k)
+        linear = [own, *self._links[k : k + 1]]
+        count = sum(part.dim for part in linear) + sum(batch.dim for batch, _ in self._answers[k])
+        written, row = np.zeros((count, self._columns)), 0
+        for part in linear:
+            after = self.theta[min(k + 1, len(self.theta) - 1)]
+            part.write(self.theta[k], after, self.coefficient_theta, written[row : row + part.dim])
+            row += part.dim
+        for batch, (residual, blocks) in self._answers[k]:
+            rows = written[row : row + batch.dim]
+            write_factor(batch, blocks, self.width, rows)
+            rows[:, -1] = -residual[0]
             if batch.loss.name != "squared":  # as in GTSAM's noise models
-                weight = math.sqrt(float(batch.loss.weight(np.sqrt(residual[0] @ residual[0]))))
-            for variable, (block,) in zip(batch.variables[0].tolist(), blocks, strict=True):
-                at = 2 * self.width if variable == COEFFICIENTS else place
-                written[row:end, at : at + block.shape[1]] = block if weight == 1.0 else weight * block
-                place += self.width
-            written[row:end, -1] = -weight * residual[0]
-            row = end
+                rows *= math.sqrt(float(batch.loss.weight(np.sqrt(residual[0] @ residual[0]))))
+            row += batch.dim
         return written
 
-    def _measured(self, k: int) -> list[FactorBatch]:
-        """The factor of a state's position, if it was measured."""
-        return [self._position_batch(self.samples[k], k)] if self.samples[k].measured else []
+    def _linear_rows(self, k: int) -> LinearRows:
+        """The rows of a state's own linear factors: its position's and its priors, those of the first one's past."""
+        batches = [*self._priors[k]]
+        if self.samples[k].measured:
+            batches.append(self._position_batch(self.samples[k], k))
+        if k == 0 and self._summary is not None:
+            batches.append(self._summary)
+        elif k == 0 and self.p:
+            batches.append(coefficient_prior(self._own_means, self._own_sigmas))
+        return LinearRows(batches, self.width, self.p, self._columns)
 
-    def _seen(self, batch: FactorBatch, k: int) -> Array:
-        """(1, d) the inputs of a batch at state k."""
-        return self.theta[k : k + 1] if batch.sees_biases else self.theta[k : k + 1, :STATE_DIM]
+    def _link(self, dt: float) -> LinearRows:
+        """The rows that link the biases of two neighbours, dt s apart."""
+        batch = BiasFactors(
+            np.zeros(1, dtype=np.int64), np.array([dt]), self.settings.bias_sigmas, self.settings.memory_time
+        )
+        return LinearRows([batch], self.width, self.p, self._columns)
 
     def _solve(self) -> int:
         """Eliminates from the first state whose rows have changed; returns the number of eliminated states.

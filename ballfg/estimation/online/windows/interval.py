@@ -126,7 +126,8 @@ def _keep(
     if len(coefficients):
         inputs = (*inputs, np.broadcast_to(coefficients, (len(start), len(coefficients))))
         blocks = (*blocks, by_start[..., STATE_DIM:])
-    residual, blocks = checked(intervals[0].batch, slice(None), inputs, residual, blocks)
+    if not (np.isfinite(residual).all() and np.isfinite(by_start).all()):
+        checked(intervals[0].batch, slice(None), inputs, residual, blocks)  # says what is not finite
     for row, interval in enumerate(intervals):
         interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))
 
@@ -135,5 +136,8 @@ def without_bias(joint: Array, width: int) -> Array:
     """(9 + p, 9 + p) covariance of a state and the coefficients, from (w + p, w + p) with the bias between them."""
     if width == STATE_DIM:
         return joint
-    kept = np.delete(np.arange(len(joint)), np.s_[STATE_DIM:width])
-    return joint[np.ix_(kept, kept)]
+    size = len(joint) - width + STATE_DIM
+    kept, own, shared = np.empty((size, size)), slice(STATE_DIM), slice(width, None)
+    kept[own, own], kept[STATE_DIM:, STATE_DIM:] = joint[own, own], joint[shared, shared]
+    kept[own, STATE_DIM:], kept[STATE_DIM:, own] = joint[own, shared], joint[shared, own]
+    return kept

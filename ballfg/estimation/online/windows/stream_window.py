@@ -243,17 +243,19 @@ class StreamWindow(ABC):
         moved = np.asarray((np.abs(self.delta) > self.threshold).any(axis=1), dtype=bool)
         limit = COEFFICIENT_THRESHOLD * self._own_sigmas
         shared = bool((np.abs(self.coefficient_delta) > limit).any())
+        touched, begins = list[Interval](), list[int]()
         if moved.any():
             self.theta = np.where(moved[:, None], self.theta + self.delta, self.theta)
             self.delta = np.where(moved[:, None], 0.0, self.delta)
+            seen = [(measurement, k) for k in np.flatnonzero(moved) for measurement in self.samples[k].measurements]
+            prepare([measurement for measurement, _ in seen], self.theta[[k for _, k in seen]])
         if shared:
             self.coefficient_theta = self.coefficient_theta + self.coefficient_delta
             self.coefficient_delta = np.zeros(self.p)
-        seen = [(measurement, k) for k in np.flatnonzero(moved) for measurement in self.samples[k].measurements]
-        prepare([measurement for measurement, _ in seen], self.theta[[k for _, k in seen]])
-        either = moved[:-1] | moved[1:] | shared
-        touched = [interval for k in np.flatnonzero(either) if (interval := self.intervals[k]) is not None]
-        begins = [interval.index - self.first for interval in touched]
+        if shared or moved.any():
+            either = np.flatnonzero(moved[:-1] | moved[1:] | shared)
+            touched = [interval for k in either if (interval := self.intervals[k]) is not None]
+            begins = [interval.index - self.first for interval in touched]
         ends = [k + 1 for k in begins]
         if new is not None:
             touched.append(new)
