@@ -1,5 +1,6 @@
 """Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
+import copy
 import weakref
 from collections.abc import Sequence
 from typing import Any
@@ -37,6 +38,12 @@ class Moving:
         *self.addresses, self._rolling = functions.addresses
         *self.weights, self._rolling_weights = functions.weights(inner)
         self._own, self._places = _present(inner, functions, names)
+
+    def at(self, start: Array) -> "Moving":
+        """Other balls (n, 9 + p) of the model, with the coefficients that it had when these were made."""
+        other = copy.copy(self)
+        other.start = start
+        return other
 
     def travel(self, dt: Array, levels: Array, start: Array | None = None) -> tuple[Array, Array, Array]:
         """Where the balls are after dt (n,) s, with a contact at each surface on the way; their heights are (n, k) m.

@@ -12,12 +12,12 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-import torch
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, plain
+from ballfg.dynamics.compiled.beliefs.edges import height_below
+from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import fly_through_jacobian, gap_jacobian
-from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.dynamics.motion.prepared import PreparedMotion
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.settings import Settings, stamp_covariance
@@ -47,6 +47,9 @@ NODES: Final = NODE_SHARE**0.5 * np.array([-(3.0**0.5), 0.0, 3.0**0.5])
 """Nodes of a Gauss-Hermite quadrature of order three for that share, in standard deviations."""
 NODE_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
 """Weights of these nodes."""
+GRID: Final = np.stack(np.meshgrid(NODES, NODES), axis=-1).reshape(-1, 2)
+GRID_LOG_WEIGHTS: Final = np.log(np.outer(NODE_WEIGHTS, NODE_WEIGHTS)).ravel()
+"""The same in two directions."""
 HORIZONTAL_SPIN: Final = slice(SPIN.start, SPIN.start + 2)
 """The components of the spin that friction at a level surface depends on."""
 
@@ -88,18 +91,25 @@ class HypothesisModel:
         """Number of values that move with the ball: state and coefficients."""
         return STATE_DIM + model_width(self.ball)
 
+    @cached_property
+    def motion(self) -> PreparedMotion:
+        """The ball's."""
+        return PreparedMotion(self.ball, self.width)
+
+    @cached_property
+    def _world(self) -> Array:
+        return world_of(self.surfaces, self.ball.radius)
+
     def level(self, mean: Array) -> float:
         """m, height of the surface below a ball (d,); -inf where there is none."""
-        state = torch.from_numpy(mean[: self.width])
-        return float(self.surfaces.height_below(state, self.ball.surface_offset(state)))
+        (above,), _ = self.motion.gaps(mean[None, : self.width], 0.0)
+        return float(height_below(plain(mean), mean[Z] - above - self.ball.radius, self._world))
 
     def gaps(self, means: Array, level: float) -> tuple[Array, Array]:
         """(n,) m between balls (n, d) and a surface, and its gradients (n, d)."""
         gradients = np.zeros(means.shape)
-        states = torch.from_numpy(np.ascontiguousarray(means[:, : self.width]))
-        gaps, slopes = gap_jacobian(self.ball, states, level)
-        gradients[:, : self.width] = slopes.numpy()
-        return gaps.numpy(), gradients
+        gaps, gradients[:, : self.width] = self.motion.gaps(means[:, : self.width], level)
+        return gaps, gradients
 
     def may_touch(self, mean: Array, covariance: Array, dt: float) -> bool:
         """True if a ball may come down to a surface within dt s; most are far: a coarse bound is first."""
@@ -120,20 +130,17 @@ class HypothesisModel:
 
     def predict_flight(self, balls: GaussianMixture, dt: float) -> GaussianMixture:
         """Balls after dt s of free flight, without surfaces."""
-        start = torch.from_numpy(np.ascontiguousarray(balls.means[:, : self.width]))
-        after, jacobian = fly_jacobian(self.ball, start, torch.full((len(start),), dt, dtype=torch.float64))
-        noise = np.repeat(self.settings.process.flight(np.array([dt])), len(start), axis=0)
-        return self._predicted(balls, after.numpy(), jacobian.numpy(), noise, dt)
+        after, jacobian = self.motion.fly(balls.means[:, : self.width], dt)
+        noise = np.repeat(self.settings.process.flight(np.array([dt])), len(after), axis=0)
+        return self._predicted(balls, after, jacobian, noise, dt)
 
     def predict_bounce(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
         """Balls after dt s with one bounce on the way, without those that never come down."""
-        start = torch.from_numpy(np.ascontiguousarray(balls.means[:, : self.width]))
-        durations = torch.full((len(start),), dt, dtype=torch.float64)
-        after, times, jacobian = fly_through_jacobian(self.ball, start, durations, (level,))
-        found = torch.isfinite(after).all(dim=1).numpy()
+        after, times, jacobian = self.motion.bounce(balls.means[:, : self.width], dt, level)
+        found = np.isfinite(after).all(axis=1)
         spans = np.full(int(found.sum()), dt)
-        noise = self.settings.process.flight(spans) + self.settings.process.contact(spans, times[:, 0].numpy()[found])
-        return self._predicted(balls.selected(found), after.numpy()[found], jacobian.numpy()[found], noise, dt)
+        noise = self.settings.process.flight(spans) + self.settings.process.contact(spans, times[found])
+        return self._predicted(balls.selected(found), after[found], jacobian[found], noise, dt)
 
     def _predicted(
         self, balls: GaussianMixture, after: Array, jacobian: Array, noise: Array, dt: float
@@ -174,11 +181,11 @@ def _at_nodes(balls: GaussianMixture) -> GaussianMixture:
     spin = covariance[HORIZONTAL_SPIN, HORIZONTAL_SPIN]
     slope = np.linalg.solve(spin, covariance[HORIZONTAL_SPIN]).T
     variances, axes = np.linalg.eigh(spin)
-    nodes = np.stack(np.meshgrid(NODES, NODES), axis=-1).reshape(-1, 2)
-    means = mean + (nodes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T @ slope.T
+    means = mean + (GRID * np.sqrt(np.maximum(variances, 0.0))) @ axes.T @ slope.T
     conditional = covariance - NODE_SHARE * slope @ spin @ slope.T
-    log_weights = balls.log_weights + np.log(np.outer(NODE_WEIGHTS, NODE_WEIGHTS)).ravel()
-    return GaussianMixture(log_weights, means, np.repeat(conditional[None], len(means), axis=0))
+    return GaussianMixture(
+        balls.log_weights + GRID_LOG_WEIGHTS, means, np.repeat(conditional[None], len(means), axis=0)
+    )
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,12 @@ def level_below(surface, x, world):
 @machine_code(REAL(REAL, ONE))
 def level_at(z, world):
     """The same for a centre at z (m), less what surfaces lie above their declared heights there."""
-    if z > world[0]:
-        return world[0]
+    return world[0] if z > world[0] else lower_level(z, world)
+
+
+@machine_code(REAL(REAL, ONE))
+def lower_level(z, world):
+    """Height (m) of what lies below the table under a centre at z (m); -inf if there is nothing."""
     return world[1] if z > world[1] - DEEPEST else -np.inf
 
 
@@ -38,6 +42,13 @@ def level_at(z, world):
 def over_table(x, world):
     """Whether a state (9,) lies within the table's ends."""
     return within(x[0], x[1], world[3:7])
+
+
+@machine_code(REAL(ONE, REAL, ONE))
+def height_below(x, raised, world):
+    """As `Surfaces.height_below`, for one ball (9,): below the table's surface, or beyond its ends, it is beside it."""
+    z = x[2] - raised
+    return level_at(z, world) if over_table(x, world) else lower_level(z, world)
 
 
 @machine_code(FLAG(ONE))
