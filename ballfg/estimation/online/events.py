@@ -128,17 +128,10 @@ def contact_step(state: Array, rise: float, dt: float) -> int:
     return 1 if time > (1 + MOVE_MARGIN) * dt else 0
 
 
-def first_difference(
-    samples: Sequence[Sample], motions: Sequence[Motion], factors: Array, begin: int = 0
-) -> int | None:
-    """The first sample from `begin` on whose motion or usability differs; None if only noise levels do.
-
-    These do not go back.
-    """
-    for k, sample in enumerate(samples[begin:], begin):
-        if k and not sample.motion.same(motions[k - 1]):
-            return k
-        if (sample.factor >= UNUSABLE) != (factors[k] >= UNUSABLE):
+def first_difference(samples: Sequence[Sample], motions: Sequence[Motion], factors: Array) -> int | None:
+    """The first sample whose motion or usability differs; None if only noise levels do, which do not go back."""
+    for k, (sample, motion, factor) in enumerate(zip(samples, motions, factors, strict=True)):
+        if not sample.motion.same(motion) or (sample.factor >= UNUSABLE) != (factor >= UNUSABLE):
             return k
     return None
 
@@ -154,21 +147,23 @@ def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -
     times, positions = path_of(samples)
     segmentation = events.segmentation(window.first, times, positions)
     found = eventful_motions(events.with_moved_contacts(segmentation, window.first), times)
-    motions = [found.get(i, FLIGHT) for i in range(len(times) - 1)]
-    measured = np.array([s.measured for s in samples])
-    factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # the loss sets wrong sightings aside
-    settled = max(held - LATEST_CHANGE, 0)
-    motions[: max(settled - 1, 0)] = [s.motion for s in samples[1:settled]]
-    factors[:settled] = [s.factor for s in samples[:settled]]
-    start = first_difference(samples[:held], motions, factors, settled)
-    reweighed = [k for k in range(held) if samples[k].factor != factors[k]]
-    for k, sample in enumerate(samples):
-        sample.factor = float(factors[k])
-        if k and (k >= held or not sample.motion.same(motions[k - 1])):
-            sample.motion = motions[k - 1]
-    again = [] if start is None else samples[max(start, 1) : held]
+    settled = max(held - LATEST_CHANGE, 0)  # samples before it stay as they are
+    young, old = samples[settled:], held - settled
+    motions = [found.get(k, FLIGHT) for k in range(settled - 1, len(samples) - 1)]
+    if not settled:
+        motions[0] = samples[0].motion
+    measured = np.array([sample.measured for sample in young])
+    quality = segmentation.quality[settled:]
+    factors = np.where(measured, SIGMA_FACTOR[quality], 1.0)  # the loss sets wrong sightings aside
+    start = first_difference(young[:old], motions[:old], factors[:old])
+    reweighed = [k for k, sample in enumerate(young[:old], settled) if sample.factor != factors[k - settled]]
+    for k, (sample, motion, factor) in enumerate(zip(young, motions, factors.tolist(), strict=True)):
+        sample.factor = factor
+        if k >= old or not sample.motion.same(motion):
+            sample.motion = motion
+    again = [] if start is None else samples[max(settled + start, 1) : held]
     if again:
-        window.retract(max(start or 0, 1))
+        window.retract(held - len(again))
     staying = [k for k in reweighed if k < len(window)]
     if staying:
         window.reweigh(staying)

@@ -131,15 +131,14 @@ class HypothesisModel:
     def predict_flight(self, balls: GaussianMixture, dt: float) -> GaussianMixture:
         """Balls after dt s of free flight, without surfaces."""
         after, jacobian = self.motion.fly(balls.means[:, : self.width], dt)
-        noise = np.repeat(self.settings.process.flight(np.array([dt])), len(after), axis=0)
-        return self._predicted(balls, after, jacobian, noise, dt)
+        return self._predicted(balls, after, jacobian, self.settings.process.flight(np.array([dt])), dt)
 
     def predict_bounce(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
         """Balls after dt s with one bounce on the way, without those that never come down."""
         after, times, jacobian = self.motion.bounce(balls.means[:, : self.width], dt, level)
         found = np.isfinite(after).all(axis=1)
-        spans = np.full(int(found.sum()), dt)
-        noise = self.settings.process.flight(spans) + self.settings.process.contact(spans, times[found])
+        process, spans = self.settings.process, np.full(int(found.sum()), dt)
+        noise = process.flight(np.array([dt])) + process.contact(spans, times[found])
         return self._predicted(balls.selected(found), after[found], jacobian[found], noise, dt)
 
     def _predicted(
@@ -157,9 +156,7 @@ class HypothesisModel:
         return GaussianMixture(balls.log_weights, means, F @ balls.covariances @ F.swapaxes(1, 2) + Q)
 
     def update(self, balls: GaussianMixture, measured: SampleMeasurement) -> tuple[GaussianMixture, float]:
-        """Balls after a measurement, and the least squared whitened innovation of the position; inf without balls."""
-        if not len(balls):
-            return balls, np.inf
+        """Balls after a measurement, and the least squared whitened innovation of the position."""
         nearest = 0.0
         if measured.position is not None:
             H = np.zeros((3, balls.means.shape[1]))
@@ -225,9 +222,14 @@ class ContactHypotheses:
 
     def updated(self, measured: SampleMeasurement) -> "ContactHypotheses":
         """The hypotheses after a further measurement at the same stamp."""
-        flying, nearest = self.model.update(self.flying, measured)
-        bounced, other = self.model.update(self.bounced, measured)
-        return replace(self, flying=flying, bounced=bounced, nearest=min(nearest, other))
+        both, nearest = self.model.update(self._both, measured)
+        first = np.arange(len(both)) == 0
+        return replace(self, flying=both.selected(first), bounced=both.selected(~first), nearest=nearest)
+
+    @property
+    def _both(self) -> GaussianMixture:
+        """The Gaussians of both hypotheses, the flying ball's first."""
+        return GaussianMixture.concatenated([self.flying, self.bounced])
 
     @cached_property
     def sides(self) -> tuple[GaussianMixture, GaussianMixture]:
@@ -241,5 +243,5 @@ class ContactHypotheses:
     @cached_property
     def _above(self) -> GaussianMixture:
         """The parts of all Gaussians above the surface, the flying ball's first."""
-        both = GaussianMixture.concatenated([self.flying, self.bounced])
+        both = self._both
         return both.truncated(*self.model.gaps(both.means, self.level))

@@ -140,7 +140,7 @@ class ChainWindow(StreamWindow):
             self._renew([0], moved=False)
             self._solve()
             return
-        carries, shared, root = (held[leaving:].copy() for held in self._chain)  # what stays is eliminated already
+        carries, shared, root = (held[leaving:] for held in self._chain)  # what stays is eliminated already
         carries[0], shared[0] = 0.0, 0.0  # the summary holds it
         self._chain = carries, shared, root
         self._rows[0] = self._rows_of(0, moved=False)
