@@ -166,14 +166,14 @@ class Propagator:
 
     def _over(self, carrier: Carrier, belief: Belief, durations: Tensor) -> Iterator[tuple[Course, Tensor]]:
         """Linear beliefs after some durations (n, k) s, a few at a time, with the elapsed time (n, j) s."""
-        if not bool(((durations >= 0) & durations.isfinite()).all()):
-            low, high = float(durations.min()), float(durations.max())
-            raise ValueError(f"dt must be finite and not negative; got {low:g} to {high:g} s")
-        moving = durations.clamp_max(LONGEST_MOTION)
-        staying, elapsed = durations - moving, durations.cumsum(1)
+        given = durations.numpy()
+        if not ((given >= 0.0) & np.isfinite(given)).all():
+            raise ValueError(f"dt must be finite and not negative; got {given.min():g} to {given.max():g} s")
+        moving = np.minimum(given, LONGEST_MOTION)
+        staying, elapsed = given - moving, durations.cumsum(1)
         course, first = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy()), 0
-        for last in sorted({*(staying > 0).any(0).nonzero()[:, 0].tolist(), durations.shape[1] - 1}):
-            part = moving[:, first : last + 1].numpy()
+        for last in sorted({*np.flatnonzero((staying > 0.0).any(0)).tolist(), durations.shape[1] - 1}):
+            part = moving[:, first : last + 1]
             counts = steps_over_each(part.max(0))
             steps, ends = np.repeat(part / counts, counts, axis=1), counts.cumsum()
             done = 0
@@ -181,9 +181,9 @@ class Propagator:
                 flown = self._steps(carrier, belief.model, course, steps[:, done : done + AT_ONCE])
                 course = flown.at(slice(-1, None))
                 asked = (done < ends) & (ends <= done + len(flown))
-                if bool((staying[:, last] > 0).any()) and done + len(flown) == steps.shape[1]:
+                if (staying[:, last] > 0.0).any() and done + len(flown) == steps.shape[1]:
                     covariance = course.covariance[-1].copy()
-                    covariance[:, :STATE_DIM, :STATE_DIM] += self.noise.flight(staying[:, last].numpy())
+                    covariance[:, :STATE_DIM, :STATE_DIM] += self.noise.flight(staying[:, last])
                     course = Course.start(course.mean[-1], covariance)
                     flown = Course.joined([flown.at(slice(-1)), course])
                 if asked.any():

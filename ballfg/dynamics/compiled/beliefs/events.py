@@ -29,24 +29,25 @@ def _rates_at(rates, rolling, resting, x, rate):
     put(rate[:3], x[3:6])
 
 
-@machine_code(several(REAL, 2)(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, ONE))
-def _value(rates, rolling, resting, x, normal, offset, after, at):
-    """Normal . x - offset some s after a state (9,), and its time derivative.
-
-    Args: at (9,): working memory.
-    """
+@machine_code(several(REAL, 2)(LAW, LAW, FLAG, ONE, ONE, REAL))
+def _value(rates, rolling, resting, x, normal, offset):
+    """Normal . x - offset at a state (9,), and its time derivative."""
     change, value, rate = np.empty(9), -offset, 0.0
-    put(at, x)
-    if resting:  # with tangents, though unused: exported C is shorter with one form
-        d = rolling.ct.shape[2]
-        fly_one(rolling, at, np.zeros((9, d)), after, np.zeros(d), 1)
-    else:
-        glide(rates, at, after, 1)
-    _rates_at(rates, rolling, resting, at, change)
+    _rates_at(rates, rolling, resting, x, change)
     for i in range(9):
-        value += normal[i] * at[i]
+        value += normal[i] * x[i]
         rate += normal[i] * change[i]
     return value, rate
+
+
+@machine_code(NOTHING(LAW, LAW, FLAG, ONE, REAL))
+def _move_on(rates, rolling, resting, x, h):
+    """Moves a state (9,) on by h s of flight or of rest."""
+    if resting:  # with tangents, though unused: exported C is shorter with one form
+        d = rolling.ct.shape[2]
+        fly_one(rolling, x, np.zeros((9, d)), h, np.zeros(d), 1)
+    else:
+        glide(rates, x, h, 1)
 
 
 @machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL))
@@ -54,7 +55,9 @@ def _exact(rates, rolling, resting, x, normal, offset, low, high):
     """The time (s) between two others at which the value is zero on the way from x; NaN where Newton leaves them."""
     at, tau, margin = np.empty(9), 0.5 * (low + high), 0.5 * (high - low)
     for _ in range(NEWTON_STEPS):
-        value, rate = _value(rates, rolling, resting, x, normal, offset, tau, at)
+        put(at, x)
+        _move_on(rates, rolling, resting, at, tau)
+        value, rate = _value(rates, rolling, resting, at, normal, offset)
         move = -value / rate
         tau += move
         if not low - margin <= tau <= high + margin:
@@ -64,15 +67,20 @@ def _exact(rates, rolling, resting, x, normal, offset, low, high):
     return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
 
 
-@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, FLAG))
-def _zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, ONE, REAL, REAL, REAL, FLAG))
+def _zero(rates, rolling, resting, x, flown, duration, normal, offset, h, earliest, either_way):
     """The first time after `earliest` in h s, of free flight or of rest, at which the value goes through zero, or NaN.
 
     Looks are at the cubic through the values and their rates at both ends, which is right to a micrometre.
+
+    Args: x (9,): the state at the beginning.  flown (9,): that after a duration (s) of flight, which h often is.
     """
-    at = np.empty(9)
-    low, low_rate = _value(rates, rolling, resting, x, normal, offset, 0.0, at)
-    high, high_rate = _value(rates, rolling, resting, x, normal, offset, h, at)
+    end = flown.copy()
+    if resting or h < duration:
+        put(end, x)
+        _move_on(rates, rolling, resting, end, h)
+    low, low_rate = _value(rates, rolling, resting, x, normal, offset)
+    high, high_rate = _value(rates, rolling, resting, end, normal, offset)
     before = low
     for look in range(1, LOOKS + 1):
         t = look / LOOKS
@@ -86,15 +94,15 @@ def _zero(rates, rolling, resting, x, normal, offset, h, earliest, either_way):
     return np.nan
 
 
-@machine_code(several(REAL, 3)(LAWS, REAL, ONE, REAL, ONE, ONE))
-def _contact_within(laws, low, x, h, world, touch):
+@machine_code(several(REAL, 3)(LAWS, REAL, ONE, ONE, REAL, ONE, ONE))
+def _contact_within(laws, low, x, after, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
 
     It is unclear if the ball falls past the table to the floor within the step. The third number is the time at which
     it falls past the table, else NaN; writes its state there to touch (9,).
+
+    Args: after (9,): the state after h s without surfaces.
     """
-    after = x.copy()
-    glide(laws.rates, after, h, 1)
     if after[5] >= 0.0 or gap_of(laws.surface, after, low, world[2]) >= 0.0:
         return np.nan, h, np.nan
     tau = come_down(laws, x, low, world, touch)
@@ -133,13 +141,16 @@ def find(
             x[5] = 0.0
             tau, past, resting = h, np.nan, True
         else:
-            low, tau, past = _contact_within(laws, low, x, h, world, touch)
+            fly_belief(laws.rates, mean, covariance, h, noise, after, spread)  # nearly always the whole step
+            low, tau, past = _contact_within(laws, low, x, after[:9], h, world, touch)
         touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
-        h, event = INSTANT if touched else tau, np.nan
+        flown, event = h, np.nan
+        h = INSTANT if touched else tau
         if not touched and not contact:
-            event = _zero(laws.rates, grounded, resting, x, normal, offset, h, earliest - passed, either_way)
+            since = earliest - passed
+            event = _zero(laws.rates, grounded, resting, x, after[:9], flown, normal, offset, h, since, either_way)
         elif not touched and not resting and math.isfinite(low) and passed + h > earliest:
             event = h
         if resting:
@@ -151,10 +162,10 @@ def find(
             after[9:] = mean[9:]
         else:
             h = event if math.isfinite(event) else h
-            fly_belief(laws.rates, mean, covariance, h, noise, after, spread)
-            if contact and low == world[0] and not over_table(after[:9], world):
-                return HARD, passed
-            if past <= h and not falls_past(laws, covariance, touch, past, h, world, after, spread):
+            if h < flown:
+                fly_belief(laws.rates, mean, covariance, h, noise, after, spread)
+            beside = contact and low == world[0] and not over_table(after[:9], world)
+            if beside or (past <= h and not falls_past(laws, covariance, touch, past, h, world, after, spread)):
                 return HARD, passed
         put(mean, after)
         put_all(covariance, spread)
