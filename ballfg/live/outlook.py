@@ -21,7 +21,7 @@ from ballfg.prediction.plane import Plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 GRID = 0.02
-"""s between the times of a path, a step of the motion. At half of it probabilities of measured tracks differ by 4e-6."""
+"""s between the times of a path, a step of the motion. At half of it those of measured tracks differ by 4e-6."""
 VAGUE = 3.0  # m/s, standard deviation of the velocity beyond which predictions carry no information
 
 
