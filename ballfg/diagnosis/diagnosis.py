@@ -86,7 +86,7 @@ def diagnose(
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
-        helped = fallback(search.fit, embedding, corrected, dataset, parts, search.judged, evaluate)
+        helped = fallback(search.fit, embedding, corrected, dataset, parts, search.judged, evaluate, jobs)
     unexplained = what_is_left(tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}

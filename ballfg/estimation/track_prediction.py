@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from ballfg.estimation.conformal import ConformalScales
 
-BLOCK = 64  # Number of tracks that are propagated together in one process; memory grows with it
+BLOCK = 16  # Number of tracks that are propagated together in one process
 Observed: TypeAlias = float | Callable[[Track], float]
 """s from a track's first stamp; or a function that gives each track its own."""
 

@@ -52,6 +52,7 @@ def fallback(
     parts: Sequence[EvaluationTrack],
     now: Errors,
     evaluate: Callable[[BallModel], Errors],
+    jobs: int = 1,
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 
@@ -63,7 +64,7 @@ def fallback(
         return None
     after = fit_with_terms(before, terms)
     model = next_shot_model(after, embedding, corrected)
-    model.noise = noise_about(model, parts, dataset, corrected.noise)
+    model.noise = noise_about(model, parts, dataset, corrected.noise, jobs=jobs)
     errors = evaluate(model)
     if errors.prediction_rmse_mm >= HELPS * now.prediction_rmse_mm:
         return None

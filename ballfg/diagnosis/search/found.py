@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import ALIKE, foretold
+from ballfg.diagnosis.evidence.rows import Motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.search.candidates import Scored
 from ballfg.diagnosis.search.changed_fits import smaller_fit
@@ -130,7 +133,8 @@ class Found(WeighedModels):
         Those that are foretold to come close are refitted: they are what cannot be told apart. An absence that is many
         standard deviations away lies beyond the linear range, so that close is a share of what the effect explains.
         """
-        best, tried, scores = self.best, dict[frozenset[str], Refit](), self.scores
+        best, scores = self.best, self.scores
+        tasks: dict[frozenset[str], Callable[[], tuple[Refit, Weighed]]] = {}
 
         def exchanged(gone: str, one: int) -> frozenset[str]:
             return best.names - {gone} | {screen.candidates[one].name}
@@ -138,22 +142,22 @@ class Found(WeighedModels):
         for gone, one in sorted(screen.exchanges, key=lambda exchange: -scores[exchanged(*exchange)]):
             other, own = screen.candidates[one], next(h for h in best.named if h.name == gone)
             explains = best.score - best.nested[best.names - {gone}].score
-            close = scores[exchanged(gone, one)] > scores[best.names] - max(-np.log(ALIKE), ALIKE * explains)
-            if len(tried) == MOST_EXCHANGES or not close or exchanged(gone, one) in self.models:
+            names = exchanged(gone, one)
+            close = scores[names] > scores[best.names] - max(-np.log(ALIKE), ALIKE * explains)
+            if len(tasks) == MOST_EXCHANGES or not close or names in self.models or names in tasks:
                 continue
             tell(f"fitting with {other.name} in place of {gone}")
             candidate = next(s for s in scored if s.hypothesis is other)
-            refitted = refit(smaller_fit(best, [own], self.first), candidate)
-            named = (*(h for h in best.named if h is not own), other)
-            found = weighed(refitted.fit, named, self.motion, self.halves, best)
-            self.models[found.names] = found
-            tried[found.names] = refitted
-        winner = self.most_probable(self.models[names] for names in tried)
+            tasks[names] = partial(_in_place, best, own, candidate, self.first, self.motion, self.halves)
+        made = do_all(list(tasks.values()), self.jobs)
+        self.models |= {found.names: found for _, found in made}
+        winner = self.most_probable(found for _, found in made)
         if winner is None or not self.is_better(winner):
             return None
         self.best = winner
-        tell(f"{tried[winner.names].name} exchanged for another")
-        return tried[winner.names]
+        refitted = next(refitted for refitted, found in made if found is winner)
+        tell(f"{refitted.name} exchanged for another")
+        return refitted
 
     def compare(self) -> None:
         """Weighs something nameless beside the best model, and if it is there, which effects are there beside it.
@@ -256,3 +260,12 @@ class Found(WeighedModels):
             if least is None or not self.is_better(least):
                 return self.best is not whole
             self.best = least
+
+
+def _in_place(
+    best: Weighed, gone: Hypothesis, candidate: Scored, first: Fit, motion: Motion, halves: Mask
+) -> tuple[Refit, Weighed]:
+    """The refit of a model with a candidate in the place of one of its effects, and how probable it is."""
+    refitted = refit(smaller_fit(best, [gone], first), candidate)
+    named = (*(h for h in best.named if h.name != gone.name), candidate.hypothesis)
+    return refitted, weighed(refitted.fit, named, motion, halves, best)
