@@ -9,7 +9,7 @@ import pytest
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.graph import objective
 from ballfg.factors.linear.step import weighted
-from ballfg.factors.loss import LEAST_STRETCH, Loss
+from ballfg.factors.loss import LEAST_STRETCH, Loss, weight_of
 from ballfg.factors.position import PositionFactors
 
 NORMS = np.concatenate((np.linspace(0.0, 12.0, 49), [1e3, 1e8]))
@@ -23,6 +23,13 @@ def test_value_and_weight_are_gtsam_s(name, scale) -> None:
     theirs = estimator.Create(scale)
     np.testing.assert_allclose(loss.value(NORMS), [theirs.loss(d) for d in NORMS], rtol=1e-12)
     np.testing.assert_allclose(loss.weight(NORMS), [theirs.weight(d) for d in NORMS], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["squared", "huber", "cauchy"])
+def test_weights_of_machine_code(name) -> None:
+    loss, norms = Loss(name, 2.5), np.array([0.0, 1.0, 2.5, 2.6, 40.0])
+    own = [weight_of(loss.kind, loss.scale, float(norm**2)) for norm in norms]
+    np.testing.assert_allclose(own, loss.weight(norms), rtol=1e-14)
 
 
 def test_squared() -> None:

@@ -9,12 +9,19 @@ import torch
 
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.online.online import Online
-from ballfg.estimation.online.windows.window_filter import carried_with_bias
+from ballfg.estimation.online.state import Sample
+from ballfg.estimation.online.windows.interval import IntervalMaker
+from ballfg.estimation.online.windows.rows import LinearRows
+from ballfg.estimation.online.windows.window_filter import WindowFilter, carried_with_bias
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.motion import FLIGHT
 from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.factors.batch import COEFFICIENTS
 from ballfg.factors.bridge import STATE_KEY, Bridge
+from ballfg.factors.correlated_noise import BiasedPositionFactors, BiasFactors
 from ballfg.factors.loss import Loss
+from ballfg.factors.prior import coefficient_prior, spin_label
 from tests.estimation.online.streams import (
     BOUNCING,
     FLYING,
@@ -176,6 +183,76 @@ def test_a_bias_is_carried_beside_the_state_and_in_front_of_the_coefficients():
     np.testing.assert_allclose(found[9:], decay * (bias + shift))
     np.testing.assert_allclose(noise[:9, :9], covariance)
     np.testing.assert_allclose(np.diag(noise)[9:], np.square([0.002, 0.003, 0.004]) * (1.0 - decay**2))
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.004])
+@pytest.mark.parametrize("far", [1e-3, 0.3])
+def test_a_step_of_the_filter_is_a_textbook_s(memory, far):
+    """Prediction, a sample with the error of its stamp, and an update that a robust loss weighs; bias and coefficients.
+
+    The gain is written with the inverse of the innovation's covariance.
+    """
+    rng, loss = np.random.default_rng(7), Loss("huber", 2.0)
+    own = settings(memory=(memory,) * 3, memory_time=0.05, stamp_jitter=1e-3, loss=loss)
+    w = 12 if memory else 9
+    interval = IntervalMaker(nominal_model(), own.process).make(0, FLIGHT, 0.01)
+    piece, point, mean = rng.normal(size=(9, 12)), rng.normal(size=w), rng.normal(size=w + 2)
+    root = 0.01 * rng.normal(size=(w + 2, w + 2))
+    covariance, shared = root @ root.T, rng.normal(size=2)
+    carried, noise = piece, interval.covariance
+    if memory:
+        carried, noise = carried_with_bias(piece, noise, point[9:], 0.01, own)
+    F, Q = np.eye(w + 2), np.zeros((w + 2, w + 2))
+    F[:w], Q[:w, :w] = carried[:, 1:], noise
+    expected = F @ (mean - np.concatenate((point, shared)))
+    expected[:w] += carried[:, 0]
+    expected[w:] = mean[w:]
+    spread, H = F @ covariance @ F.T + Q, np.zeros((3, w + 2))
+    H[:, :3] = np.eye(3)
+    if memory:
+        H[:, 9:12] = np.eye(3)
+    sample = Sample(0.01, H @ expected + far, np.full(3, 2e-3))
+    way = 1e-3 * expected[3:6]
+    R = np.diag(sample.stated**2) + np.outer(way, way)
+    innovation = np.linalg.solve(np.linalg.cholesky(H @ spread @ H.T + R), np.full(3, far))
+    R /= float(loss.weight(np.array([np.linalg.norm(innovation)]))[0])
+    gain = spread @ H.T @ np.linalg.inv(H @ spread @ H.T + R)
+    found = WindowFilter(own, w).step(piece, point, mean, shared, covariance, interval, sample)
+    np.testing.assert_allclose(found[0], expected + gain @ np.full(3, far), rtol=1e-9)
+    np.testing.assert_allclose(found[1], spread - gain @ H @ spread, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found[2], innovation, rtol=1e-9)
+    np.testing.assert_allclose(sample.velocity, expected[3:6])
+
+
+def test_linear_rows_about_other_points_are_those_of_the_factors():
+    """A position and a prior with robust losses, the link of two biases and what is known of the coefficients."""
+    rng, w, p = np.random.default_rng(8), 12, 2
+    one, loss = np.zeros(1, dtype=np.int64), Loss("cauchy", 1.5)
+    position, sigma = rng.normal(size=(1, 3)), np.full((1, 3), 0.1)
+    batches = [
+        BiasedPositionFactors(one, position, sigma, loss=loss),
+        spin_label(one, rng.normal(size=(1, 3)), np.full((1, 3), 2.0), Loss("huber", 0.5)),
+        BiasFactors(one, np.array([0.01]), np.array([0.002, 0.003, 0.004]), 0.02),
+        coefficient_prior(np.array([0.1, 0.9]), np.array([0.01, 0.02])),
+    ]
+    rows = LinearRows(batches, w, p, columns=28)
+    state, after, shared = rng.normal(size=w), rng.normal(size=w), rng.normal(size=p)
+    found, begin = np.zeros((rows.dim, 28)), 0
+    rows.write(state, after, shared, found)
+    for batch in batches:
+        points = [shared if v == COEFFICIENTS else (state, after)[k] for k, v in enumerate(batch.variables[0].tolist())]
+        inputs = tuple(x[None] if batch.sees_biases or len(x) == p else x[None, :9] for x in points)
+        (residual,), blocks = batch.compute(slice(None), inputs)
+        expected, place = np.zeros((batch.dim, 28)), 0
+        for variable, (block,) in zip(batch.variables[0].tolist(), blocks, strict=True):
+            at = 2 * w if variable == COEFFICIENTS else place
+            expected[:, at : at + block.shape[1]] = block
+            place += w
+        expected[:, -1] = -residual
+        expected *= np.sqrt(batch.loss.weight(np.array([np.linalg.norm(residual)])))
+        np.testing.assert_allclose(found[begin : begin + batch.dim], expected, rtol=1e-9, atol=1e-9)
+        begin += batch.dim
+    assert begin == rows.dim
 
 
 def test_whether_the_ball_has_bounced_in_the_last_intervals():

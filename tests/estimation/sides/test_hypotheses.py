@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal, norm
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled import motion
+from ballfg.dynamics.motion.prepared import PreparedMotion
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.sides.gaussians import GaussianMixture
@@ -44,6 +45,35 @@ def test_gaps_by_machine_code_and_by_torch(monkeypatch: pytest.MonkeyPatch) -> N
     for own, right in zip(found, hypothesis_model(ball).gaps(means, 0.3), strict=True):
         np.testing.assert_allclose(own, right, rtol=1e-13, atol=1e-13)
     assert np.abs(found[1][:, [0, 1, 9]]).min() > 0.0
+
+
+def test_flight_and_bounce_by_machine_code_and_by_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """States, their derivatives and contact times; one ball never comes down."""
+    ball = AugmentedModel(table_tennis().model, ("bounce.restitution.e",))
+    means = np.tile(np.append(FALLING, 0.9), (3, 1)) + 0.01 * np.random.default_rng(5).normal(size=(3, 10))
+    means[2, 2:6] = 1.0, 4.0, 0.3, 2.5
+    found = PreparedMotion(ball, 10)
+    fast = (*found.fly(means, 0.01), *found.bounce(means, 0.02, 0.0))
+    monkeypatch.setattr(motion, "functions_of", lambda _: None)
+    slow = PreparedMotion(ball, 10)
+    for own, right in zip(fast, (*slow.fly(means, 0.01), *slow.bounce(means, 0.02, 0.0)), strict=True):
+        np.testing.assert_allclose(own[:2], right[:2], rtol=1e-10, atol=1e-10)
+    assert np.isfinite(fast[3][:2]).all()
+    assert np.isnan(fast[3][2])
+    assert np.isnan(fast[2][2]).any()
+
+
+@pytest.mark.parametrize("extent", [None, (0.0, 2.74, -0.7, 0.7)])
+@pytest.mark.parametrize("floor", [None, -0.76])
+def test_the_surface_below_one_ball_is_that_of_the_surfaces(extent, floor) -> None:
+    """Above and below the table, beside it, and deep below the lowest surface."""
+    surfaces, model = Surfaces(0.0, floor, extent), table_tennis().model
+    places = [(x, 0.0, z) for x in (-1.0, 1.0) for z in (0.3, 0.001, -0.1, -0.7, -1.2)]
+    states = np.zeros((len(places), 9))
+    states[:, :3] = places
+    own = [HypothesisModel(model, surfaces, QUIET).level(state) for state in states]
+    moved = torch.from_numpy(states)
+    assert own == surfaces.height_below(moved, model.surface_offset(moved)).tolist()
 
 
 def test_a_gaussian_is_cut_as_an_integral_over_it_says() -> None:
