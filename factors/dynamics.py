@@ -145,10 +145,13 @@ class DynamicsFactors(FactorBatch):
         return np.empty((len(self.dt[rows]), 0))
 
     def moved(self, start: Array, rows: Index | slice) -> tuple[Array, Array]:
-        """As `propagate`, of arrays; by machine code once `prepared`."""
+        """F and its Jacobian, (k, 9 + p) and (k, 9 + p, 9 + p), as of `propagate`; by machine code once `prepared`.
+
+        Args: start: (k, 9 + p) augmented states.  rows: (k,) index of the factors, or a slice.
+        """
         if self._moving is None:
-            after, jacobian = self.propagate(torch.from_numpy(start), rows)
-            return plain(after.cpu().numpy()), plain(jacobian.cpu().numpy())
+            found = self.propagate(torch.from_numpy(start), rows)
+            return plain(found[0].cpu().numpy()), plain(found[1].cpu().numpy())
         after, jacobian, _ = self._moving.travel(plain(self.dt[rows]), self._levels(rows), start)
         return after, jacobian
 

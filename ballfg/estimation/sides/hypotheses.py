@@ -17,7 +17,7 @@ from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.edges import height_below
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.prepared import PreparedMotion
+from ballfg.dynamics.motion.contact import PreparedMotion
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.settings import Settings, stamp_covariance
@@ -136,7 +136,7 @@ class HypothesisModel:
     def predict_bounce(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
         """Balls after dt s with one bounce on the way, without those that never come down."""
         after, times, jacobian = self.motion.bounce(balls.means[:, : self.width], dt, level)
-        found = np.isfinite(after).all(axis=1)
+        found = np.asarray(np.isfinite(after).all(axis=1))
         process, spans = self.settings.process, np.full(int(found.sum()), dt)
         noise = process.flight(np.array([dt])) + process.contact(spans, times[found])
         return self._predicted(balls.selected(found), after[found], jacobian[found], noise, dt)
