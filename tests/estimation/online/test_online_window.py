@@ -22,6 +22,7 @@ from ballfg.factors.bridge import STATE_KEY, Bridge
 from ballfg.factors.correlated_noise import BiasedPositionFactors, BiasFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.prior import coefficient_prior, spin_label
+from ballfg.tracks import Track
 from tests.estimation.online.streams import (
     BOUNCING,
     FLYING,
@@ -222,6 +223,15 @@ def test_a_step_of_the_filter_is_a_textbook_s(memory, far):
     np.testing.assert_allclose(found[1], spread - gain @ H @ spread, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found[2], innovation, rtol=1e-9)
     np.testing.assert_allclose(sample.velocity, expected[3:6])
+
+
+def test_positions_may_be_columns_of_a_larger_table():
+    track, _ = make_track(FLYING, n=12, surfaces=NOWHERE)
+    table = np.asfortranarray(track.positions)
+    strided = Track(track.times, table, sigmas=np.asfortranarray(np.full((12, 3), SIGMA)))
+    plain = Track(track.times, track.positions, sigmas=np.full((12, 3), SIGMA))
+    found, expected = (Online(nominal_model(), NOWHERE, settings()).estimate(one) for one in (strided, plain))
+    np.testing.assert_array_equal(found.states, expected.states)
 
 
 def test_linear_rows_about_other_points_are_those_of_the_factors():

@@ -62,8 +62,8 @@ class WindowFilter:
         innovation = np.empty(3)
         if sample.measured:
             loss, way = self.settings.loss, self.settings.stamp_jitter * sample.velocity
-            errors = (sample.sigma, way, loss.kind, loss.scale)
-            if not _correct(sample.position, *errors, self.width, innovation, after, spread):
+            errors = (plain(sample.sigma), way, loss.kind, loss.scale)
+            if not _correct(plain(sample.position), *errors, self.width, innovation, after, spread):
                 raise RuntimeError("the covariance of a sample's innovation is not positive definite")
         for measurement in sample.measurements:
             after, spread = measurement.corrected(after, spread)
