@@ -152,7 +152,7 @@ class DynamicsFactors(FactorBatch):
         if self._moving is None:
             found = self.propagate(torch.from_numpy(start), rows)
             return plain(found[0].cpu().numpy()), plain(found[1].cpu().numpy())
-        after, jacobian, _ = self._moving.travel(plain(self.dt[rows]), self._levels(rows), start)
+        after, jacobian, _ = self._moving.at(start).travel(plain(self.dt[rows]), self._levels(rows))
         return after, jacobian
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:

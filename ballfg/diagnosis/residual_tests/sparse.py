@@ -52,7 +52,7 @@ def fallback(
     parts: Sequence[EvaluationTrack],
     now: Errors,
     evaluate: Callable[[BallModel], Errors],
-    jobs: int = 1,
+    jobs: int,
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 

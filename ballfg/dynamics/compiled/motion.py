@@ -45,15 +45,14 @@ class Moving:
         other.start = start
         return other
 
-    def travel(self, dt: Array, levels: Array, start: Array | None = None) -> tuple[Array, Array, Array]:
+    def travel(self, dt: Array, levels: Array) -> tuple[Array, Array, Array]:
         """Where the balls are after dt (n,) s, with a contact at each surface on the way; their heights are (n, k) m.
 
-        Args: start: (n, 9 + p) other balls of the model, with the coefficients that it had when these were made.
         Returns: states (n, 9 + p), their derivatives (n, 9 + p, d) and the contact times (n, k) s; NaN after a contact
             that never comes.
         Raises: ValueError: if a duration is infinite.
         """
-        start = self.start if start is None else start
+        start = self.start
         after, moved, times = np.empty_like(start), np.empty((*start.shape, self.width)), np.empty_like(levels)
         own, places = self._own[:ROLLING], self._places[:ROLLING]
         given = (*self.addresses, *own, *places, *self.weights, start, dt, levels)

@@ -4,6 +4,8 @@ The contact time is a function of the state. A search finds it without a graph; 
 Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up
 to the third, so that both the saltation term of a Jacobian and the Hessian of a loss come out of autograd right
 (docs/derivations/contact.md).
+
+`PreparedMotion` is for callers that move the balls of one model often.
 """
 
 import math
@@ -244,7 +246,7 @@ class PreparedMotion:
         if self._moving is None:
             flown, jacobian = fly_jacobian(self.model, torch.from_numpy(start), torch.from_numpy(durations))
             return flown.numpy(), jacobian.numpy()
-        after, moved, _ = self._moving.travel(durations, np.empty((len(start), 0)), start)
+        after, moved, _ = self._moving.at(start).travel(durations, np.empty((len(start), 0)))
         return after, moved
 
     def bounce(self, start: Array, dt: float, height: float) -> tuple[Array, Array, Array]:
@@ -257,7 +259,7 @@ class PreparedMotion:
             given = (torch.from_numpy(start), torch.from_numpy(durations), (height,))
             after, times, jacobian = (found.numpy() for found in fly_through_jacobian(self.model, *given))
             return after, times[:, 0], jacobian
-        after, moved, times = self._moving.travel(durations, np.full((len(start), 1), height), start)
+        after, moved, times = self._moving.at(start).travel(durations, np.full((len(start), 1), height))
         return after, times[:, 0], moved
 
     def gaps(self, states: Array, height: float) -> tuple[Array, Array]:
