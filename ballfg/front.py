@@ -177,7 +177,7 @@ def predict(
 
     check_observe(observe)
     observe = float(observe)
-    data = _in_flight(data).dataset if isinstance(data, Dataset) else data
+    data = _in_flight(data, jobs).dataset if isinstance(data, Dataset) else data
     estimator = estimator_for(data, method, model, surfaces, settings, observe)
     predicted = partial(predict_tracks, estimator, observe=observe, horizon=horizon, jobs=jobs)
     scales = _scales(conformal, data, predicted, method, observe)
@@ -185,11 +185,13 @@ def predict(
     return {one.name: one if scales is None else scales.scaled(one) for one in found}
 
 
-def _in_flight(data: Dataset) -> "InFlight":
+def _in_flight(data: Dataset, jobs: int = 1) -> "InFlight":
     """The flights of a dataset, and how much of it they are."""
     from ballfg.estimation.flights.dataset import in_flight as found_in
+    from ballfg.parallel.parts import using
 
-    return found_in(data)
+    with using(jobs):
+        return found_in(data)
 
 
 def _refuse(conformal: Conformal) -> None:
@@ -251,7 +253,7 @@ def diagnose(measured: "Tracks | Folder", model: Model = None, *, jobs: int = 1)
         return on_one_thread(partial(diagnose_one_view, data, jobs=jobs), _model(model, data))
     data = _table_of_positions(data)
     # as in the commands: threads gain nothing on such small batches, and slow each other down
-    return on_one_thread(partial(diagnose_dataset, _in_flight(data).dataset, jobs=jobs), _model(model, data))
+    return on_one_thread(partial(diagnose_dataset, _in_flight(data, jobs).dataset, jobs=jobs), _model(model, data))
 
 
 def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> "ErrorBudget":
@@ -272,7 +274,7 @@ def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int =
     from ballfg.diagnosis.error_budget import error_budget as budget_of_dataset
     from ballfg.parallel.work import on_one_thread
 
-    return on_one_thread(partial(budget_of_dataset, _in_flight(data).dataset, jobs=jobs), _model(model, data))
+    return on_one_thread(partial(budget_of_dataset, _in_flight(data, jobs).dataset, jobs=jobs), _model(model, data))
 
 
 def _table_of_positions(measured: object) -> Dataset:

@@ -209,12 +209,14 @@ def open_inputs(
         ball: name of the dataset's known ball; None: any ball.
     """
     from ballfg.estimation import dataset_surfaces
+    from ballfg.estimation.batch import start_early
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects_files)
     data = with_readings(read_dataset(dataset))
     found, doubts = _opened(data, model, ball)
+    start_early(len(data))
     return Inputs(data, found, dataset_surfaces(data), observed, doubts)
 
 
@@ -346,8 +348,11 @@ def workers(cluster: str | None, address: str | None, jobs: int) -> Iterator[int
     Returns: the number of processes.
     Raises: ValueError, ConnectionError: as `ballfg.parallel.on_cluster`.
     """
+    from ballfg.parallel.parts import using
+
     if cluster is None and address is None:
-        yield jobs
+        with using(jobs):
+            yield jobs
         return
     from ballfg.parallel import on_cluster
 

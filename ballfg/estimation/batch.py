@@ -12,7 +12,7 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.result import Estimate
 from ballfg.parallel.executor import executor
-from ballfg.parallel.parts import with_jobs
+from ballfg.parallel.parts import jobs_here, with_jobs
 from ballfg.parallel.processes import Processes
 from ballfg.parallel.stream import finished, in_order, shared
 from ballfg.parallel.work import each, on_one_thread
@@ -25,6 +25,7 @@ PROBED = 9  # Tracks that are done in this process first, to time one
 START_UP = 5.0
 """s until worker processes help (they import torch and gtsam): less work stays in this process. Many short calls count
 together: none of them is worth it by itself."""
+MANY = 500  # Tracks that usually take as long: 10 ms each
 _spent = 0.0  # s of work so far that worker processes could have shared, had they been there
 
 
@@ -46,6 +47,13 @@ def estimate_tracks(
 def _without_world(made: Callable[[Track], Estimate], track: Track) -> Estimate:
     """The estimate without its model, so that processes need not send it with every track."""
     return replace(made(track), world=None)
+
+
+def start_early(count: int) -> None:
+    """Starts the processes for many tracks: they load their libraries while this one finds flights and noise."""
+    others = executor(jobs_here())
+    if isinstance(others, Processes) and count >= MANY and not others.started:
+        others.start(__name__)
 
 
 def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: int, jobs: int) -> Iterator[R]:

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
 from itertools import islice
@@ -19,13 +20,25 @@ AHEAD: Final = 4  # Items of a generator that are made ahead
 _JOBS: ContextVar[int] = ContextVar("jobs", default=1)
 
 
-def with_jobs(jobs: int, function: Callable[[T], R], argument: T) -> R:
-    """The result of a function whose parts may use several processes."""
+@contextmanager
+def using(jobs: int) -> Iterator[None]:
+    """Lets the block's work use several processes."""
     token = _JOBS.set(jobs)
     try:
-        return function(argument)
+        yield
     finally:
         _JOBS.reset(token)
+
+
+def jobs_here() -> int:
+    """Number of processes that the present work may use."""
+    return _JOBS.get()
+
+
+def with_jobs(jobs: int, function: Callable[[T], R], argument: T) -> R:
+    """The result of a function whose parts may use several processes."""
+    with using(jobs):
+        return function(argument)
 
 
 def in_parts(function: Callable[[T], R], parts: Sequence[T], together: int) -> Iterator[R]:

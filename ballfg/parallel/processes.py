@@ -20,7 +20,7 @@ from queue import SimpleQueue
 from typing import IO, Any, Final, cast
 
 from ballfg.parallel.same_versions import own_versions
-from ballfg.parallel.work import Work, packed
+from ballfg.parallel.work import Work, loaded, packed
 
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 MOST_DEATHS: Final = 3  # largest number of processes that a chunk may lose: it is then the probable cause
@@ -44,6 +44,12 @@ class Processes:
     def started(self) -> bool:
         """True if this number of processes was started before; they may still exist."""
         return _crew.size >= self.slots
+
+    def start(self, module: str) -> None:
+        """Starts them; each imports a module and what this needs, while the calling process does something else."""
+        send = self.sender(loaded)
+        for _ in range(self.slots):
+            send([module])
 
     def sender(
         self, function: Callable[[Sequence[Any]], Any], told: Told | None = None

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
+from importlib import import_module
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -68,6 +69,12 @@ def too_many_deaths(cluster: str, first: str) -> ChildProcessError:
 def each(function: Callable[[Any], R], chunk: Sequence[Any]) -> list[R]:
     """A function of each item of a chunk."""
     return [function(item) for item in chunk]
+
+
+def loaded(modules: Sequence[str]) -> None:
+    """Imports modules by their names."""
+    for name in modules:
+        import_module(name)
 
 
 def on_one_thread(function: Callable[[T], R], argument: T) -> R:

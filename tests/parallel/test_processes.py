@@ -180,3 +180,19 @@ def test_a_process_that_was_started_elsewhere_works_in_the_current_folder(
     assert Processes(1, helped=False).sender(folder)([0]).result() == os.getcwd()
     monkeypatch.chdir(tmp_path)
     assert Processes(1, helped=False).sender(folder)([0]).result() == str(tmp_path.resolve())
+
+
+def test_a_process_that_starts_early_loads_a_module_and_does_the_later_work() -> None:
+    """Its number is that of the process that computes; the module is there before any work asks for it."""
+    processes = Processes(1, helped=False)
+    send = processes.sender(_seen)
+    begun, _ = send(["colorsys"]).result()
+    processes.start("colorsys")
+    deadline = time.monotonic() + 60.0
+    while not send(["colorsys"]).result()[1]:
+        assert time.monotonic() < deadline
+    assert send(["colorsys"]).result() == (begun, True)
+
+
+def _seen(chunk: Sequence[str]) -> tuple[int, bool]:
+    return os.getpid(), chunk[0] in sys.modules

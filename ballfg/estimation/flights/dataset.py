@@ -2,18 +2,20 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import islice, pairwise
+from functools import lru_cache, partial
+from itertools import islice, pairwise, tee
 from typing import Final
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.nominal import nominal_model
+from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.flights.falling import contrasts, scatter
 from ballfg.estimation.flights.labels import FEWEST, SHORTEST, Labels, label_samples
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
+from ballfg.parallel.parts import jobs_here
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.track import Label as TrackLabel
 
@@ -140,8 +142,10 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     def whole(track: Track, labels: Labels) -> bool:
         return bool(labels.estimable(track.positions[:, 2], levels).all())
 
-    labelled = ((track, label_samples(track, physics, levels)) for track in islice(iter(dataset), most))
-    found = Contents.of(labelled, whole)
+    tracks, copies = tee(islice(iter(dataset), most))
+    count = len(dataset) if most is None else min(most, len(dataset))
+    labels = map_tracks(partial(label_samples, physics=physics, levels=levels), copies, count, jobs_here())
+    found = Contents.of(zip(tracks, labels, strict=True), whole)
     mixed = sum(pieces is not None for pieces in found.pieces.values())
     flights = FlightsOf(dataset, found.pieces) if mixed else dataset
     return InFlight(flights, len(found.pieces), mixed, found.share, found.smoothing, found.others)

@@ -12,7 +12,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.flights.decode import decode
 from ballfg.estimation.flights.falling import falls_throughout, scatter
-from ballfg.estimation.flights.modes import BOUNCE, CHANGE, ROLLING, STILL, STRIKE
+from ballfg.estimation.flights.modes import BOUNCE, CHANGE, HANDLED, ROLLING, STILL, STRIKE, SWAYED
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.bank import FLYING, Scene
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
@@ -98,9 +98,10 @@ def _explained(
     )
     scene = Scene(physics, Surfaces(0.0), settings)
     given = times - times[0], np.array(positions, order="C"), np.array(sigmas, order="C")
-    (alone, least), (events, most) = (decode(*given, hands, scene.numbers) for hands in (False, True))
-    if most - least < HANDS:
-        events = alone
+    events, most = decode(*given, True, scene.numbers)
+    if ((events["surface"] >= HANDLED) & (events["surface"] <= SWAYED)).any():
+        alone, least = decode(*given, False, scene.numbers)
+        events = events if most - least >= HANDS else alone
     modes, lost = np.zeros(n, np.int64), np.zeros(n, dtype=bool)
     plain = events[["kind", "index", "surface"]].tolist()
     for kind, index, mode in plain:

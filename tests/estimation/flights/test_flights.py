@@ -10,15 +10,19 @@ import pytest
 
 import ballfg as bf
 from ballfg.dynamics import nominal_model
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.flights.dataset import error_ratios, flies_throughout, flights_of, in_flight, pieces_of
+from ballfg.estimation.flights.decode import decode
 from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.flights.falling import falls_throughout, scatter
-from ballfg.estimation.flights.labels import label_samples
-from ballfg.estimation.flights.modes import _wandered
+from ballfg.estimation.flights.labels import MARGIN, MOST, label_samples
+from ballfg.estimation.flights.modes import HANDLED, SWAYED, _wandered
 from ballfg.estimation.result import Label
-from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED
+from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED, Scene
 from ballfg.estimation.segmentation.log import chain, compact
 from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
 from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
@@ -198,3 +202,19 @@ def test_events_that_no_hypothesis_has_are_dropped() -> None:
     kept["tip"] = 5
     assert compact(kept, log, 6) == 3
     assert chain(kept["tip"][0], log)["index"].tolist() == [1, 3, 5]
+
+
+def test_without_a_hand_in_it_an_explanation_is_that_of_flights_alone() -> None:
+    """So one pass is enough where the best explanation has no hand: of launched balls, and of recordings."""
+    agreed = 0
+    launched = [shot.track for shot in simulate(SimulationConfig(tracks=25, seed=31))]
+    for track in (*launched, *(recording(seed).track for seed in (9100, 9103))):
+        scene = Scene(PHYSICS, Surfaces(0.0), SegmentationSettings(most=MOST, margin=MARGIN, slack_drift=0.0))
+        sigmas = np.maximum(np.tile(scatter(track.seconds, track.positions), (len(track), 1)), 1.5e-3)
+        given = track.seconds, np.array(track.positions, order="C"), sigmas
+        (alone, least), (events, most) = (decode(*given, hands, scene.numbers) for hands in (False, True))
+        if not ((events["surface"] >= HANDLED) & (events["surface"] <= SWAYED)).any():
+            assert most == pytest.approx(least, abs=1e-9)
+            assert events[["kind", "index", "surface"]].tolist() == alone[["kind", "index", "surface"]].tolist()
+            agreed += 1
+    assert agreed >= 20
