@@ -336,9 +336,30 @@ def model_alone(model: Path | None, ball: str | None) -> "tuple[BallModel, Setti
 
 
 def check_out(out: Path, dataset: Path) -> None:
-    """Refuses a result in the place of the measurements. Raises: ValueError: if `out` is a table of the dataset."""
-    if out.stem in DATASET_TABLES and out.resolve().parent == dataset.resolve():
-        raise ValueError(f"out must not be a table of the dataset itself; got {out}. Choose another name.")
+    """Refuses a result in the place of measurements.
+
+    Raises: ValueError: if `out` is, or leads to, a table of this dataset or of another one, that of an observation too.
+    """
+    from ballfg.estimation.observations.registry import OBSERVATIONS
+    from ballfg.tracks.info import INFO_FILE
+
+    place = out.resolve()
+    tables = {*DATASET_TABLES, *(Path(kind.file).stem for kind in OBSERVATIONS.values() if kind.file is not None)}
+    own = place.parent == dataset.resolve()
+    if place.stem in tables and (own or (place.parent / INFO_FILE).is_file()):
+        whose = "the dataset itself" if own else "a dataset"
+        raise ValueError(f"out must not be a table of {whose}; got {out}. Choose another name.")
+
+
+def check_model_out(out: Path) -> None:
+    """Refuses a model in the place of another file. Raises: ValueError: not .yaml, or a file that holds no model."""
+    from ballfg.dynamics.model_file import SECTIONS
+    from ballfg.files.strict_yaml import read_mapping
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise ValueError(f"out must be a model file; got {out}. Let its name end in .yaml.")
+    if out.exists() and not set(read_mapping(out)) <= set(SECTIONS):
+        raise ValueError(f"out must be a model file; {out} holds something else. Choose another name.")
 
 
 @contextmanager

@@ -219,6 +219,25 @@ def test_the_measurements_are_not_replaced(
     assert {p.name: p.read_bytes() for p in damaged.iterdir()} == before
 
 
+@pytest.mark.parametrize("command", [("estimate",), ("predict", "--observe", "0.2")])
+def test_nor_through_a_link_nor_readings_nor_those_of_another_dataset(
+    damaged: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    other = shutil.copytree(dataset, tmp_path / "other")
+    (tmp_path / "out.csv").symlink_to(damaged / "tracks.csv")
+    (other / "speeds.csv").write_text("trajectory,t,speed,sigma\n")
+    before = {p: p.read_bytes() for folder in (damaged, other) for p in folder.iterdir()}
+    of_others = "out must not be a table of a dataset; got"
+    for out, message in (
+        (tmp_path / "out.csv", "out must not be a table of the dataset itself; got"),
+        (damaged / "spins.csv", "out must not be a table of the dataset itself; got"),
+        (other / "tracks.csv", of_others),
+        (other / "speeds.csv", of_others),
+    ):
+        assert_refused(capsys, out, message, damaged, *command[1:], command=command[0])
+    assert {p: p.read_bytes() for folder in (damaged, other) for p in folder.iterdir()} == before
+
+
 def test_missing_option(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert status("estimate", dataset) == 2
     assert "--out" in capsys.readouterr().err

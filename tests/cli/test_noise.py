@@ -43,12 +43,16 @@ def test_table_and_files(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     [
         (["nowhere"], "nowhere"),
         (["SHOTS", "--out", "SHOTS/dataset.yaml"], "out must be a model file"),
+        (["SHOTS", "--out", "SHOTS/truth.yaml"], "out must be a model file"),
+        (["SHOTS", "--out", "SHOTS/tracks.csv"], "out must be a model file"),
         (["SHOTS", "--tracks", "2"], "'--tracks'"),
     ],
 )
 def test_bad_input(shots: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str) -> None:
+    before = {path: path.read_bytes() for path in shots.iterdir()}
     assert status("noise", *(word.replace("SHOTS", str(shots)) for word in words)) == 2
     assert message in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in shots.iterdir()} == before
 
 
 def test_pixels_of_each_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -81,8 +81,9 @@ def design(
     levels = parse_levels(candidates)
     if out is not None:
         TableWriter(out)  # refuses a path that cannot be written
-        inputs.check_out(out, dataset)
     inputs.know_observations(observations_file)
+    if out is not None:
+        inputs.check_out(out, dataset)
     opened = inputs.open_inputs(dataset, model, effects_file)
     if not isinstance(opened.model, AnalyticModel):
         raise ValueError(f"--model must be analytic: effects are added to it; {model} is a learned one. Give another.")

@@ -60,8 +60,8 @@ def estimate(
     outcome = Outcome()
     rows = hits = flying = 0
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
-        inputs.check_out(out, dataset)
         inputs.know_observations(observations_file)
+        inputs.check_out(out, dataset)
         opened = inputs.open_source(source, dataset, model, effects_file, ball=ball)
         print_doubts(inputs.filtered(opened.dataset))
         count = len(opened.dataset)

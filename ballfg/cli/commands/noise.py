@@ -82,11 +82,11 @@ def noise(
             )
         _of_pixels(inputs.open_sighted(dataset, model), tracks)
         return
+    if out is not None:
+        inputs.check_model_out(out)
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
     data = inputs.flights_only(data, anyway)
-    if out is not None and out.resolve() == (dataset / "dataset.yaml").resolve():
-        raise ValueError(f"out must be a model file; got {out}. Use --write for dataset.yaml.")
     found = estimate_noise(
         ball,
         dataset_surfaces(data),

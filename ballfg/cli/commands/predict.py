@@ -101,13 +101,13 @@ def predict(
     if asked and conformal is not None:
         raise ValueError("conformal must not be given with events: its scales are those of positions. Leave it out.")
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
-        inputs.check_out(out, dataset)
         check_observe(observe)
         if save_conformal is not None:
             check_file(save_conformal, "save_conformal")
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
         inputs.know_observations(observations_file)
+        inputs.check_out(out, dataset)
         opened = inputs.open_source(source, dataset, model, effects_file, observe, ball).in_flight(anyway)
         count = len(opened.dataset)
         estimator = opened.estimator(method, solver, group)
