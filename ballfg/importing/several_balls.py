@@ -78,7 +78,7 @@ def identified(
     That one has the name of an identity, or text in it, or its whole numbers count the shots of each.
     """
     stamps = [table.columns[name].tolist() for name in time]
-    known = [table.columns[trajectory].tolist()] if trajectory else []
+    known = [table.texts.get(trajectory, table.columns[trajectory]).tolist()] if trajectory else []
     rows = len(table)
     if not time or rows == 0 or rows == len(set(zip(*known, *stamps, strict=True))):
         return trajectory, ()

@@ -207,9 +207,10 @@ class Newcomer:
         """True if it has a sample of that stamp."""
         return any(kept.time == time for kept in self.samples)
 
-    def repeats(self, time: float, position: Array) -> bool:
-        """True if it has exactly that sample."""
-        return any(kept.time == time and np.array_equal(kept.position, position) for kept in self.samples)
+    def repeats(self, time: float, position: Array, closest: float) -> bool:
+        """True if it has a sample of that stamp within `closest` m of a position (3,) m."""
+        there = (kept.position for kept in self.samples if kept.time == time)
+        return any(bool(np.linalg.norm(position - place) < closest) for place in there)
 
     def distances(self, time: float, positions: Array) -> Array:
         """(n,) squared Mahalanobis distances of positions (n, 3) m from its region at a time."""

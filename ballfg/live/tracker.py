@@ -188,8 +188,11 @@ class Tracker:
         if frame.open:
             self._to_balls(frame, GATE, hit=False)
             self._to_newcomers(frame)
+            self._refuse_repeated(frame)  # of a newcomer that has just become a ball
             self._to_balls(frame, HIT_GATE, hit=True)
             for k in frame.open:
+                if self._repeats_newcomer(frame, k):
+                    continue
                 self._newcomers.append(Newcomer(frame.kept(k), self.gate))
                 frame.updates[k] = self._grown(self._newcomers[-1], frame, k)
             del self._newcomers[:-MOST_NEWCOMERS]
@@ -281,6 +284,8 @@ class Tracker:
 
     def _to_balls(self, frame: _Frame, gate: float, hit: bool) -> None:
         """Assigns open positions to the balls that they fit: on their path, or after a hit."""
+        if not hit:
+            self._refuse_same(frame)
         rows, t = frame.open, frame.time
         balls = [ball for ball in self._balls if ball.accepts(t) and abs(t - ball.last) <= self.gap]
         costs = np.full((len(rows), len(balls)), FAR)
@@ -296,6 +301,19 @@ class Tracker:
         if not hit:
             self._refuse_repeated(frame)
 
+    def _refuse_same(self, frame: _Frame) -> None:
+        """Refuses exact copies of a ball's positions, which another ball might fit."""
+        held = [(ball.number, kept.position) for ball in self._balls if (kept := ball.at(frame.time)) is not None]
+        for k in frame.open if held else ():
+            for number, position in held:
+                if np.array_equal(position, frame.positions[k]):
+                    self._refuse_copy(frame, k, f"ball {number} has a position of this stamp")
+                    break
+
+    def _refuse_copy(self, frame: _Frame, k: int, reason: str) -> None:
+        self.counts.repeated += 1
+        frame.refuse(k, reason)
+
     def _refuse_repeated(self, frame: _Frame) -> None:
         """Refuses a position beside one of the same ball and stamp: the ball was measured twice."""
         for k in frame.open:
@@ -304,11 +322,9 @@ class Tracker:
                 if held is None:
                     continue
                 near = self.gate.on_path(ball.known(frame.time), frame.time, frame.positions[[k]])[0] <= GATE
-                same = np.array_equal(held.position, frame.positions[k])
                 apart = float(np.linalg.norm(held.position - frame.positions[k]))
-                if same or (near and apart < 2 * self.estimator.model.radius):  # two balls cannot be closer
-                    self.counts.repeated += 1
-                    frame.refuse(k, f"ball {ball.number} has a position of this stamp")
+                if near and apart < 2 * self.estimator.model.radius:  # two balls cannot be closer
+                    self._refuse_copy(frame, k, f"ball {ball.number} has a position of this stamp")
                     break
 
     def _taken(self, ball: Ball, frame: _Frame, k: int, kept: Kept) -> BallUpdate:
@@ -340,9 +356,15 @@ class Tracker:
             insort(newcomer.samples, frame.kept(k))
             frame.updates[k] = self._grown(newcomer, frame, k)
         for k in frame.open:
-            if any(newcomer.repeats(t, frame.positions[k]) for newcomer in self._newcomers):
-                self.counts.repeated += 1
-                frame.refuse(k, "a newcomer has this position already")
+            self._repeats_newcomer(frame, k)
+
+    def _repeats_newcomer(self, frame: _Frame, k: int) -> bool:
+        """Refuses a position where a newcomer is at the same stamp: two balls cannot be as close."""
+        closest = 2 * self.estimator.model.radius
+        repeated = any(newcomer.repeats(frame.time, frame.positions[k], closest) for newcomer in self._newcomers)
+        if repeated:
+            self._refuse_copy(frame, k, "a newcomer has a position of this stamp")
+        return repeated
 
     def _grown(self, newcomer: Newcomer, frame: _Frame, k: int) -> BallUpdate:
         """A newcomer's update with a sample, which may make it a ball."""

@@ -1,7 +1,7 @@
 """Reads, checks and writes `dataset.yaml`, the description of a dataset."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ INFO_FILE = "dataset.yaml"
 NO_SURFACE = "none"  # in place of a table's height
 _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
+_FIELDS = {"frame": ("up", "table_height", "table"), "ball": ("radius", "mass"), "lamp": ("place", "sigma")}
 _KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import", "doubts", "lamp")
 
 # The largest plausible values in SI units; larger ones are almost surely in another unit.
@@ -231,13 +232,23 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
         info = DatasetInfo.from_mapping(content)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-    absent = [key for key in _OPTIONAL if key not in content]
-    unknown = [key for key in content if key not in _KNOWN]
-    hints = {key: did_you_mean(key, absent) for key in unknown[:MAX_LISTED]}
+    hints = _unknown(content, _KNOWN, _OPTIONAL)
+    for section, fields in _FIELDS.items():
+        if isinstance(content.get(section), dict):
+            hints |= _unknown(content[section], fields, fields, f"{section}.")
+    hidden, hints = len(hints) - MAX_LISTED, dict(list(hints.items())[:MAX_LISTED])
     notes = [f"{INFO_FILE}: field {shown(key)} ignored{'.' + hint if hint else ''}" for key, hint in hints.items()]
-    if len(unknown) > MAX_LISTED:
-        notes.append(f"{INFO_FILE}: {len(unknown) - MAX_LISTED} more fields ignored")
+    if hidden > 0:
+        notes.append(f"{INFO_FILE}: {hidden} more fields ignored")
     return info, notes
+
+
+def _unknown(
+    content: Mapping[Any, Any], known: Collection[str], proposed: Collection[str], prefix: str = ""
+) -> dict[str, str]:
+    """A hint for each unknown field of a section; empty where none is near."""
+    absent = [key for key in proposed if key not in content]
+    return {f"{prefix}{key}": did_you_mean(str(key), absent) for key in content if key not in known}
 
 
 def write_info(path: Path, info: DatasetInfo) -> None:
@@ -256,6 +267,8 @@ def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], pr
         )
     for name in fields:
         _need(section, name, f"{prefix}{key}.")
+    if commas := [name for name, value in section.items() if value is None and str(name).isdigit()]:
+        raise ValueError(f"{prefix}{key} must have a decimal point in each number; got a comma before {commas[0]}.")
     return section
 
 

@@ -332,3 +332,26 @@ def test_text_without_end_is_refused(name: str, text: str, words: str, tmp_path:
     (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=words):
         tables_of(tmp_path / name)
+
+
+@pytest.mark.parametrize("names", [["1.1", "1.10"], [str(10**24), str(10**24 + 1)], [str(2**63), str(2**63 + 2)]])
+def test_shots_whose_names_are_one_number_stay_apart(names: list[str], shots: list[Track], tmp_path: Path) -> None:
+    lines, end = ["trajectory,t,x,y,z"], 0.0
+    for name, shot in zip(names, shots, strict=False):  # one clock that goes on
+        rows = np.column_stack((end + shot.seconds, shot.positions)).tolist()
+        lines += [",".join(map(str, (name, *row))) for row in rows]
+        end += shot.seconds[-1] + 1.0
+    source = tmp_path / "shots.csv"
+    source.write_text("\n".join(lines))
+    assert status("import", source, "--out", tmp_path / "out") == 0
+    found = list(read_dataset(tmp_path / "out"))
+    assert [(track.name, len(track)) for track in found] == [
+        (name, len(shot)) for name, shot in zip(names, shots, strict=False)
+    ]
+
+
+def test_an_import_into_its_own_source_does_not_take_itself_in(shots: list[Track], tmp_path: Path) -> None:
+    written(tmp_path / "shots.csv", columns_of(shots))
+    for flag in ((), ("--force",), ("--force",)):
+        assert status("import", tmp_path, "--out", tmp_path / "out", *flag) == 0
+        assert len(read_dataset(tmp_path / "out")) == len(shots)

@@ -258,3 +258,26 @@ def test_any_stream_is_answered_position_by_position(seed: int) -> None:
             assert all(np.isfinite(u.state.mean).all() for u in updates if u.state is not None)
     live.end()
     assert live.counts.balls == live.counts.lost
+
+
+@pytest.mark.parametrize("apart", [0.0, 2e-3])
+@pytest.mark.parametrize("together", [False, True])
+def test_a_ball_that_is_measured_twice_at_each_stamp_is_one_ball(apart: float, *, together: bool) -> None:
+    """Duplicated packets, or two sensors: from the first sample on, in one call or in two."""
+    samples, live = rows(shots(1)[0])[:30], tracker()
+    for time, *place in samples.tolist():
+        pair = np.array([place, np.add(place, [0.0, apart, 0.0])])
+        for positions in [pair] if together else pair:
+            live.push(time, positions)
+    assert (live.counts.balls, live.counts.repeated) == (1, len(samples))
+    assert live.balls[1].time == samples[-1, 0]
+
+
+def test_a_late_copy_goes_to_no_other_ball() -> None:
+    """The other one was seen after the copied sample, and could have been anywhere then."""
+    samples, live = rows(shots(1)[0])[:9], tracker()
+    for k, (time, *place) in enumerate(samples.tolist()):
+        other = np.add(place, [0.0, 1.8, 0.0])
+        live.push(time, np.array([place, other] if k > 4 else [place]))
+    (update,) = live.push(samples[3, 0], samples[3, 1:])
+    assert (update.kind, update.reason) == ("refused", "ball 1 has a position of this stamp")

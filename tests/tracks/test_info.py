@@ -78,6 +78,23 @@ def test_unknown_fields_are_noted_with_the_nearest_name(make_folder):
     ]
 
 
+def test_unknown_fields_of_sections_are_noted_too(make_folder):
+    frame, ball = "{up: z, table_height: 0.0, tabel: {x: [0, 1]}}", "{radius: 0.02, mass: 0.0027, colour: white}"
+    dataset = read_dataset(make_folder(yaml=_yaml(frame=f"frame: {frame}", ball=f"ball: {ball}")))
+    assert dataset.notes == [
+        "dataset.yaml: field 'frame.tabel' ignored. Did you mean 'table'?",
+        "dataset.yaml: field 'ball.colour' ignored",
+    ]
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"frame": "frame: {up: z, table_height: 0,76}"}, {"ball": "ball: {radius: 0,02, mass: 0.0027}"}]
+)
+def test_a_decimal_comma_is_no_height_of_zero(make_folder, wrong):
+    with pytest.raises(ValueError, match="decimal point"):
+        read_dataset(make_folder(yaml=_yaml(**wrong)))
+
+
 def test_of_many_unknown_fields_the_first_are_named(make_folder):
     dataset = read_dataset(make_folder(yaml=_yaml(rest="\n".join(f"own_{k}: {k}" for k in range(MAX_LISTED + 3)))))
     assert len(dataset.notes) == MAX_LISTED + 1

@@ -30,15 +30,16 @@ class RawTable:
     source: str = ""  # name of the file, for messages
     named: bool = True  # True if the columns have names of their own
     notes: list[str] = field(default_factory=list)  # omissions during reading
-    texts: dict[str, Column] = field(default_factory=dict)  # columns of numbers with some other cells, as written
+    texts: dict[str, Column] = field(default_factory=dict)
+    """Columns as written, of numbers with some other cells, or of which several are one number: 1.1 and 1.10."""
 
     @property
     def doubts(self) -> dict[str, str]:
         """A sentence for each column of numbers with other cells that count as missing."""
         found = {}
         for name, text in self.texts.items():
-            wrong = [cell for cell in text.tolist() if cell.lower() not in MISSING and _real(cell) is None]
-            found[name] = f"column {shown(name)}: {len(wrong)} cells such as {shown(wrong[0])} count as missing"
+            if wrong := [cell for cell in text.tolist() if cell.lower() not in MISSING and _real(cell) is None]:
+                found[name] = f"column {shown(name)}: {len(wrong)} cells such as {shown(wrong[0])} count as missing"
         return found
 
     def __len__(self) -> int:
@@ -108,7 +109,8 @@ def _from_text(label: str, cells: list[str]) -> tuple[Column, str, Column | None
         parsed = [convert(cells[i]) for i in present]
         wrong = [cells[i] for i, value in zip(present, parsed, strict=True) if value is None]
         if present and not wrong:
-            return _filled(len(cells), present, parsed), label, None
+            several = len({cells[i] for i in present}) > len(set(parsed))  # names, perhaps, that numbers cannot tell
+            return _filled(len(cells), present, parsed), label, _objects(cells) if several else None
     if present and len(wrong) <= (1.0 - _MOSTLY) * len(present):
         return _filled(len(cells), present, parsed), label, _objects(cells)
     found = [WITH_UNIT.match(cells[i]) for i in present]  # such as "12.5 mm", with one unit in all of them

@@ -14,6 +14,7 @@ from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.registry import FORMATS, Format
 from ballfg.importing.formats.text_files import decoded, text_table
+from ballfg.tracks.info import INFO_FILE
 
 TEXT: Final = (".csv", ".tsv", ".txt", ".dat", ".tab", ".asc", "")
 JSON: Final = (".json", ".jsonl", ".ndjson")
@@ -69,6 +70,8 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and file.suffix.lower() in known]
     files = [file for file in files if not file.name.startswith(".") and file.name not in _OWN]
     files = [file for file in files if "readme" not in file.name.lower()]
+    made = {info.parent for info in path.rglob(INFO_FILE)} - {path}  # datasets, such as an earlier import's result
+    files = [file for file in files if made.isdisjoint(file.parents)]
     if not files:
         listing = listed(sorted(entry.name for entry in path.iterdir()))
         raise ValueError(f"{path} must hold files of measurements, such as .csv or .json; got {listing}. Name another.")
