@@ -51,7 +51,8 @@ def final_estimate(
     first = window.first
     part = track.between(float(track.times[first]), float(track.times[-1]))
     problem = smoother.problem(part, found)
-    late = smoother.result(problem, smoother.settle(problem, Earlier(window.values, window.summaries())))
+    settled = smoother.settle(problem, Earlier(window.values, window.summaries()))
+    late = smoother.result(problem, settled, begins=not first)
     if not frozen:
         return late
     joints = np.array([f.joint for f in frozen])

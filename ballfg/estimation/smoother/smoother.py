@@ -21,7 +21,13 @@ from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.sides.monitor import widened_near_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
-from ballfg.estimation.smoother.second_look.at_end import with_both_sides
+from ballfg.estimation.smoother.second_look.at_end import (
+    Solved,
+    from_before_a_bounce,
+    log_odds,
+    with_both_sides,
+    with_other_beginning,
+)
 from ballfg.estimation.smoother.second_look.low_hops import LowHops, counted, low_hops, uncounted_note, with_low_hops
 from ballfg.estimation.smoother.second_look.spin_ambiguity import rival_note, with_other_spins
 from ballfg.estimation.smoother.settle import (
@@ -252,10 +258,19 @@ class Smoother(Estimator):
                 return self.problem(loose, problem.segmentation)
         return None
 
-    def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
-        """The estimate of a track from a solution."""
+    def result(self, problem: TrackProblem, solution: Solution, *, begins: bool = True) -> Estimate:
+        """The estimate of a track from a solution.
+
+        Args: begins: True if the first state is the track's, False if earlier samples are known.
+        """
+        rival: Solved | None = from_before_a_bounce(self, problem, solution) if begins else None
+        if rival is not None and log_odds(solution, rival[1]) < 0.0:
+            (problem, solution), rival = rival, (problem, solution)
         known = self.optimizer.covariances(solution.graph, solution.minimum)
         estimate = self.at_minimum(problem, solution, known)
+        if rival is not None:
+            other = self.at_minimum(*rival, self.optimizer.covariances(rival[1].graph, rival[1].minimum))
+            estimate = with_other_beginning(estimate, other, log_odds(solution, rival[1]))
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
             return estimate
         estimate = with_both_sides(self, problem, estimate)

@@ -1,16 +1,27 @@
-"""Estimates the last state of a track that ends near a contact, where no later sample shows the side."""
+"""Estimates the last state of a track that ends near a contact, and the first of one that begins there.
 
+No sample beyond shows the side there.
+"""
+
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+import torch
 
 from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.contact import bounced, gap_jacobian
 from ballfg.estimation.result import Estimate
+from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.estimation.sides.hypotheses import HypothesisModel, measured_at
-from ballfg.estimation.sides.monitor import ContactMonitor, with_contact_states
+from ballfg.estimation.sides.monitor import ContactMonitor, widening, with_contact_states
 from ballfg.estimation.smoother.problem import TrackProblem
+from ballfg.estimation.smoother.settle import LEAST_FALL, Earlier, Solution
+from ballfg.factors.batch import Values
+from ballfg.factors.graph import Convergence
 from ballfg.factors.linear.definite import definite
-from ballfg.state import STATE_DIM
+from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
@@ -22,6 +33,12 @@ LEAST: Final = 3
 """Least number of samples before them."""
 MEMORY: Final = 256
 """Number of samples that determine a state at their end."""
+SIGMAS: Final = 3.0
+"""Standard deviations of the gap at a first sample, within which the ball may have bounced right after it."""
+ROUNDS: Final = 8  # Of a search for the velocity before a bounce, whose error a round halves at least
+CERTAIN: Final = 1e-4  # Chance of the other side below which it widens nothing
+
+Solved = tuple[TrackProblem, Solution]
 
 
 def with_both_sides(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
@@ -74,3 +91,100 @@ def _filtered(smoother: "Smoother", track: Track) -> tuple[Array, Array] | None:
     width = STATE_DIM + len(biases)
     order = np.r_[:STATE_DIM, width : width + p, STATE_DIM:width]
     return mean, definite(known.joint(-1)[np.ix_(order, order)])
+
+
+def from_before_a_bounce(smoother: "Smoother", problem: TrackProblem, solution: Solution) -> Solved | None:
+    """The track with a contact right after its first sample, where there may be one; None for other tracks.
+
+    The ball rises from a surface there. The later samples cannot show what was before, and the first one seems to be an
+    outlier; here it counts.
+    """
+    track, values, events = problem.track, solution.minimum.values, solution.events
+    found, contacts = events.segmentation, events.contacts
+    disturbed = {*found.hits.tolist(), *(rest.first for rest in found.rests)}
+    if track.rough or problem.one_view or len(track) <= LEAST or 0 in disturbed:
+        return None
+    if all(contact.interval for contact in contacts):
+        begun = _before_contact_at_start(smoother, problem, solution)
+        if begun is None:
+            return None
+        contacts, values = (begun[0], *contacts), begun[1]
+    elif found.quality[0] == Quality.GOOD:
+        return None
+    quality = found.quality.copy()
+    quality[0] = Quality.GOOD
+    other = smoother.problem(track, replace(found, quality=quality, contacts=contacts))
+    other.added += problem.added
+    settled = smoother.settle(other, Earlier(values))
+    reached = settled.minimum.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
+    return (other, settled) if reached and any(c.interval == 0 for c in settled.events.contacts) else None
+
+
+def _before_contact_at_start(
+    smoother: "Smoother", problem: TrackProblem, solution: Solution
+) -> tuple[Contact, Values] | None:
+    """A contact right after the first sample and values from before it; None where the ball does not rise from one."""
+    values, times = solution.minimum.values, problem.track.times
+    speed, step = float(values.states[0, VZ]), float(times[1] - times[0])
+    if speed <= 0.0:
+        return None
+    own = np.tile(values.coefficients[: problem.width], (2, 1))
+    start, later = torch.from_numpy(np.concatenate((values.states[:2], own), axis=1)).split(1)
+    height = smoother.surfaces.level_below(later, problem.ball.surface_offset(later))  # the first may seem below it
+    if not bool(smoother.surfaces.over_table(start)):
+        return None
+    found, slope = gap_jacobian(problem.ball, start, height)
+    gap = float(found)
+    if not gap < speed * step or gap > SIGMAS * _sigma_at_start(smoother, problem, solution, slope[0].numpy()):
+        return None
+    states, label = values.states.copy(), problem.settings.spin_label(problem.track)
+    states[0, SPIN] = 0.0 if label is None else label.spin
+    states[0, VELOCITY] = _velocity_before(problem.ball, values.coefficients[: problem.width], states[0])
+    states[0, Z] -= 2.0 * gap if gap < 0.0 else max(gap - 0.5 * speed * step, 0.0)
+    contact = Contact(0, float(times[0]) + min(abs(gap) / speed, step), float(height))
+    return contact, replace(values, states=states)
+
+
+def _velocity_before(ball: BallModel, coefficients: Array, after: Array) -> Array:
+    """(3,) m/s, from which a bounce of the spin of `after` (9,) makes its velocity, found by repetition."""
+    before = torch.from_numpy(np.concatenate((after, coefficients))[None])
+    target = before[0, VELOCITY].clone()
+    before[0, VZ] *= -1.0
+    for _ in range(ROUNDS):
+        missing = target - bounced(ball, before)[0, VELOCITY]
+        before[0, VELOCITY] += missing * torch.tensor([1.0, 1.0, -1.0], dtype=missing.dtype)
+        before[0, VZ] = min(float(before[0, VZ]), -LEAST_FALL)
+    return before[0, VELOCITY].numpy()
+
+
+def _sigma_at_start(smoother: "Smoother", problem: TrackProblem, solution: Solution, slope: Array) -> float:
+    """m, standard deviation of the gap at the first sample; slope: (9 + p,) derivatives by state and coefficients."""
+    known = smoother.optimizer.covariances(solution.graph, solution.minimum)
+    if known is None:
+        return 0.0
+    width, p = solution.minimum.values.width, problem.width
+    order = np.r_[:STATE_DIM, width : width + p]
+    return float(np.sqrt(slope @ known.joint(0)[np.ix_(order, order)] @ slope))
+
+
+def log_odds(solution: Solution, other: Solution) -> float:
+    """nats, by which one solution is more probable than another: of their evidence in Laplace's approximation."""
+    cost = []
+    for one in (solution, other):
+        assert one.minimum.step is not None
+        spread = sum(batch.log_spread() for batch in one.graph.batches if len(batch))
+        cost.append(one.minimum.error + one.minimum.step.root.log_determinant + spread)
+    return cost[1] - cost[0]
+
+
+def with_other_beginning(estimate: Estimate, other: Estimate, odds: float) -> Estimate:
+    """The estimate with a first covariance that holds another estimate's first state too; odds: log, of its own."""
+    chance = float(1.0 / (1.0 + np.exp(min(odds, 100.0))))
+    if chance < CERTAIN:
+        return estimate
+    covariances = estimate.covariances.copy()
+    others = estimate.other_sides.copy() if len(estimate.other_sides) else np.zeros_like(covariances)
+    more = widening(covariances[0], other.covariances[0], other.states[0] - estimate.states[0], chance)
+    covariances[0] += more
+    others[0] += more
+    return replace(estimate, covariances=covariances, other_sides=others)
