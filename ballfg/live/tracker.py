@@ -25,6 +25,7 @@ MOST_BALLS = 16  # Largest number of balls at once
 MOST_NEWCOMERS = 32
 """Largest number of possible balls. The oldest are dropped first, so that clutter costs a bounded time."""
 FARTHEST = 1000.0  # m, of a coordinate. A larger one is in another unit.
+LATEST = 1e11  # s, of a stamp: 3,000 years. A larger one is in another unit.
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,10 +181,11 @@ class Tracker:
             if given.shape not in ((3,), points.shape):
                 raise ValueError(f"sigmas must be (3,) or as positions, {points.shape}; got {given.shape}.")
             spreads = list(np.broadcast_to(given, points.shape))
-        since = self._origin.elapsed(as_float("time", time, "s"))
+        stamp = as_float("time", time, "s")
+        since = self._origin.elapsed(stamp) if abs(stamp) <= LATEST else stamp * np.inf
         frame = _Frame(since, False, points, spreads, [None] * len(points))
         self.counts.positions += len(points)
-        self._refuse_unusable(frame)
+        self._refuse_unusable(frame, stamp)
         gone = self._turn_clock(frame) if frame.open else []
         if frame.open:
             self._to_balls(frame, GATE, hit=False)
@@ -223,11 +225,11 @@ class Tracker:
         self._begin()
         return gone
 
-    def _refuse_unusable(self, frame: _Frame) -> None:
+    def _refuse_unusable(self, frame: _Frame, stamp: float) -> None:
         good = [bool((np.abs(position) <= FARTHEST).all()) for position in frame.positions]  # NaN is not
         for k, (point, sigma) in enumerate(zip(frame.positions, frame.sigmas, strict=True)):
             if not np.isfinite(frame.time):
-                reason = "the stamp is not finite"
+                reason = f"the stamp is beyond {LATEST:g} s" if np.isfinite(stamp) else "the stamp is not finite"
             elif not good[k]:
                 far = np.isfinite(point).all()
                 reason = f"a coordinate is beyond {FARTHEST:g} m" if far else "a coordinate is not finite"

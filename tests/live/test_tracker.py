@@ -131,6 +131,7 @@ def test_older_and_repeated_stamps_are_counted_and_dropped() -> None:
         (0.3, [2000.0, 0.0, 300.0], "a coordinate is beyond 1000 m"),
         (0.3, [1e300, 0.0, 0.3], "a coordinate is beyond 1000 m"),
         (math.inf, [0.0, 0.0, 0.3], "the stamp is not finite"),
+        (1e308, [0.0, 0.0, 0.3], "the stamp is beyond 1e+11 s"),
     ],
 )
 def test_unusable_samples_change_nothing(time: float, position: list[float], reason: str) -> None:
