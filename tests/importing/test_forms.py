@@ -70,6 +70,18 @@ def semicolons_and_decimal_commas(folder: Path, shots: list[Track]) -> Path:
     return path
 
 
+def points_in_thousands(folder: Path, shots: list[Track]) -> Path:
+    """Millimetres as a German spreadsheet shows them: 1.319,3152."""
+    path, turned = folder / "tabelle.csv", str.maketrans(",.", ".,")
+    rows = [
+        [f"{v:,.{digits}f}".translate(turned) for v, digits in zip((t, *(1e3 * p)), (9, 4, 4, 4), strict=True)]
+        for shot, times in zip(shots, one_after_the_other(shots), strict=True)
+        for t, p in zip(times, shot.positions, strict=True)
+    ]
+    path.write_text("\n".join(["Zeit [s];X [mm];Y [mm];Z [mm]", *map(";".join, rows)]))
+    return path
+
+
 def tabs_with_a_row_of_units(folder: Path, shots: list[Track]) -> Path:
     path = folder / "export.tsv"
     rows = [(t, *(p / 0.0254), 0.4) for shot in shots for t, p in zip(shot.times, shot.positions, strict=True)]
@@ -225,9 +237,9 @@ def headers_of_three_lines(folder: Path, shots: list[Track]) -> Path:
 
 Form = Callable[[Path, list[Track]], Path]
 FORMS: tuple[Form, ...] = (
-    csv_millimetres_y_up, semicolons_and_decimal_commas, tabs_with_a_row_of_units, no_header_at_all, nested_json,
-    json_lines_of_nanoseconds, parquet_of_dates_and_feet, excel_with_a_sheet_a_shot, hdf5_with_z_down,
-    npz_in_microseconds, matlab_structures, matlab_7_3, a_folder_with_one_file_a_shot, an_mcap_bag,
+    csv_millimetres_y_up, semicolons_and_decimal_commas, points_in_thousands, tabs_with_a_row_of_units,
+    no_header_at_all, nested_json, json_lines_of_nanoseconds, parquet_of_dates_and_feet, excel_with_a_sheet_a_shot,
+    hdf5_with_z_down, npz_in_microseconds, matlab_structures, matlab_7_3, a_folder_with_one_file_a_shot, an_mcap_bag,
 )  # fmt: skip
 
 

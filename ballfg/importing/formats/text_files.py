@@ -18,7 +18,8 @@ from ballfg.importing.names import unit_of_text
 SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 _COMMENTS: Final = ("#", "%", "//")
 _NUMBER: Final = re.compile(r"^[-+]?(\d++\.?\d*+|\.\d++)([eE][-+]?\d++)?$")
-_DECIMAL_COMMA: Final = re.compile(r"^[-+]?\d*,\d+([eE][-+]?\d++)?$")
+_DECIMAL_COMMA: Final = re.compile(r"^[-+]?(?:\d{1,3}(?:\.\d{3})+|\d*),\d+([eE][-+]?\d++)?$")  # 1.234,5 too
+_POINTS_IN_THOUSANDS: Final = re.compile(r"^[-+]?\d{1,3}(?:\.\d{3})+(?:,\d+)?$")
 _LOOK: Final = 200  # number of lines for finding the separator
 _HEAD: Final = 4096  # number of bytes at the beginning for recognising text
 _CONTROL: Final = 0.02  # share of control characters from which a file is not text
@@ -70,7 +71,7 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
     rows = _cells(rows_of_text, separator)
     comma = separator != "," or any(_DECIMAL_COMMA.match(cell) for row in rows[-5:] for cell in row)
     if comma and any(_DECIMAL_COMMA.match(cell) for row in rows for cell in row):
-        rows = [[cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell for cell in row] for row in rows]
+        rows = [[_with_point(cell) for cell in row] for row in _without_thousands(rows)]
     start = _first_data_row(rows)
     if start is None:
         shown = rows_of_text[0][:60] if rows_of_text else comments[0][:60]
@@ -89,6 +90,18 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
     if len(rows) - start > len(data):
         table.notes.append(f"{len(rows) - start - len(data)} lines without {width} cells left out")
     return table
+
+
+def _with_point(cell: str) -> str:
+    return cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell
+
+
+def _without_thousands(rows: list[list[str]]) -> list[list[str]]:
+    """Rows with decimal commas, where points in a number can only separate thousands: 1.234,5 and 1.234."""
+    pattern = _POINTS_IN_THOUSANDS
+    if not any("." in cell and "," in cell and pattern.match(cell) for row in rows for cell in row):
+        return rows
+    return [[cell.replace(".", "") if pattern.match(cell) else cell for cell in row] for row in rows]
 
 
 def _separator(lines: Sequence[str]) -> str:
