@@ -135,6 +135,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(
         ((*out,), "either --images or --intrinsics must be given, and not both"),
         ((*BOARD, *images(calib), "--out", tmp_path / "c.txt"), "out must end in .yaml, .yml, .xml, .json"),
         ((*BOARD, *images(calib), "--out", tmp_path / "no" / "c.yaml"), "out must be in an existing folder"),
+        ((*BOARD, *images(calib), "--out", calib / "table.yaml"), "out must be new or a file of cameras"),
         ((*BOARD, *images(calib), "--intrinsics", "c.yaml", *table, *out), "and not both"),
         (("--intrinsics", calib / "lenses.yaml", *out), "--intrinsics must come with --table"),
         (

@@ -81,6 +81,8 @@ def calibrate_cameras(
     if out.suffix.lower() not in (*OURS, *THEIRS):
         raise ValueError(f"out must end in {', '.join((*OURS, *THEIRS))}; got {out}. Choose the format by the ending.")
     check_file(out)
+    if out.exists() and not _holds_cameras(out):
+        raise ValueError(f"out must be new or a file of cameras; {out} holds something else. Choose another name.")
     if (intrinsics is None) == (images is None):
         raise ValueError("either --images or --intrinsics must be given, and not both. Lenses come from one of them.")
     if intrinsics is not None and table is None:
@@ -169,6 +171,15 @@ def _placed(
     points = marked.cameras[camera.name]
     place = calibrate_extrinsics(camera, points) if focal_sigma is None else pose_and_focal(camera, points, focal_sigma)
     return Calibration(place.camera, lens, place)
+
+
+def _holds_cameras(path: Path) -> bool:
+    from ballfg.vision.camera_file import read_cameras
+
+    try:
+        return bool(read_cameras(path, posed=False))
+    except (ValueError, TypeError):
+        return False
 
 
 def _write(out: Path, found: "list[Calibration]", shown: "Mapping[str, Image]", marked: "TableFile | None") -> None:
