@@ -95,7 +95,10 @@ def c_header(model: BallModel, name: str, noise: ProcessNoise | None = None) -> 
     Raises: ValueError: for another name, or a model that has no machine code.
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name):
-        raise ValueError(f"name must be a letter and up to 30 letters, digits or underscores; got {shown(name)}")
+        raise ValueError(
+            f"name must be a letter and up to 30 letters, digits or underscores; got {shown(name)}. "
+            "Choose another one: functions and the file share it."
+        )
     functions = compiled(model)
     if functions is None:
         raise ValueError(f"model must have machine code to be exported; {type(model).__name__} runs in torch alone")
