@@ -36,6 +36,7 @@ MEMORY: Final = 256
 SIGMAS: Final = 3.0
 """Standard deviations of the gap at a first sample, within which the ball may have bounced right after it."""
 ROUNDS: Final = 8  # Of a search for the velocity before a bounce, whose error a round halves at least
+UNEVEN: Final = 0.1  # m, more than a surface lies off its declared height
 CERTAIN: Final = 1e-4  # Chance of the other side below which it widens nothing
 
 Solved = tuple[TrackProblem, Solution]
@@ -126,7 +127,8 @@ def _before_contact_at_start(
     """A contact right after the first sample and values from before it; None where the ball does not rise from one."""
     values, times = solution.minimum.values, problem.track.times
     speed, step = float(values.states[0, VZ]), float(times[1] - times[0])
-    if speed <= 0.0:
+    above = np.abs(values.states[0, Z] - np.array(smoother.surfaces.heights())).min(initial=np.inf)
+    if speed <= 0.0 or above - problem.ball.radius > speed * step + UNEVEN:
         return None
     own = np.tile(values.coefficients[: problem.width], (2, 1))
     start, later = torch.from_numpy(np.concatenate((values.states[:2], own), axis=1)).split(1)
