@@ -1,7 +1,7 @@
 """Reads, checks and writes `dataset.yaml`, the description of a dataset."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -232,23 +232,20 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
         info = DatasetInfo.from_mapping(content)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-    hints = _unknown(content, _KNOWN, _OPTIONAL)
-    for section, fields in _FIELDS.items():
-        if isinstance(content.get(section), dict):
-            hints |= _unknown(content[section], fields, fields, f"{section}.")
-    hidden, hints = len(hints) - MAX_LISTED, dict(list(hints.items())[:MAX_LISTED])
-    notes = [f"{INFO_FILE}: field {shown(key)} ignored{'.' + hint if hint else ''}" for key, hint in hints.items()]
-    if hidden > 0:
-        notes.append(f"{INFO_FILE}: {hidden} more fields ignored")
+    unknown: list[tuple[str, str, tuple[str, ...], dict[str, Any]]] = [
+        (key, key, _OPTIONAL, content) for key in content if key not in _KNOWN
+    ]
+    for name, fields in _FIELDS.items():
+        section = content.get(name)
+        if isinstance(section, dict):
+            unknown += [(f"{name}.{key}", str(key), fields, section) for key in section if key not in fields]
+    notes = []
+    for label, key, fields, section in unknown[:MAX_LISTED]:
+        hint = did_you_mean(key, (field for field in fields if field not in section))
+        notes.append(f"{INFO_FILE}: field {shown(label)} ignored{'.' + hint if hint else ''}")
+    if len(unknown) > MAX_LISTED:
+        notes.append(f"{INFO_FILE}: {len(unknown) - MAX_LISTED} more fields ignored")
     return info, notes
-
-
-def _unknown(
-    content: Mapping[Any, Any], known: Collection[str], proposed: Collection[str], prefix: str = ""
-) -> dict[str, str]:
-    """A hint for each unknown field of a section; empty where none is near."""
-    absent = [key for key in proposed if key not in content]
-    return {f"{prefix}{key}": did_you_mean(str(key), absent) for key in content if key not in known}
 
 
 def write_info(path: Path, info: DatasetInfo) -> None:

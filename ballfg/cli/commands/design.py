@@ -79,10 +79,9 @@ def design(
     from ballfg.tracks import TableWriter
 
     levels = parse_levels(candidates)
-    if out is not None:
-        TableWriter(out)  # refuses a path that cannot be written
     inputs.know_observations(observations_file)
     if out is not None:
+        TableWriter(out)  # refuses a path that cannot be written
         inputs.check_out(out, dataset)
     opened = inputs.open_inputs(dataset, model, effects_file)
     if not isinstance(opened.model, AnalyticModel):

@@ -264,13 +264,14 @@ class Smoother(Estimator):
         Args: begins: True if the first state is the track's, False if earlier samples are known.
         """
         rival: Solved | None = from_before_a_bounce(self, problem, solution) if begins else None
-        if rival is not None and log_odds(solution, rival[1]) < 0.0:
-            (problem, solution), rival = rival, (problem, solution)
+        odds = np.inf if rival is None else log_odds(solution, rival[1])
+        if rival is not None and odds < 0.0:
+            (problem, solution), rival, odds = rival, (problem, solution), -odds
         known = self.optimizer.covariances(solution.graph, solution.minimum)
         estimate = self.at_minimum(problem, solution, known)
         if rival is not None:
             other = self.at_minimum(*rival, self.optimizer.covariances(rival[1].graph, rival[1].minimum))
-            estimate = with_other_beginning(estimate, other, log_odds(solution, rival[1]))
+            estimate = with_other_beginning(estimate, other, odds)
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
             return estimate
         estimate = with_both_sides(self, problem, estimate)
