@@ -33,6 +33,16 @@ def test_the_first_state_after_a_bounce_is_honest(name: str) -> None:
     assert np.median(held.sharpness) < 0.5
 
 
+def test_sides_are_followed_until_they_are_clear_at_a_high_rate() -> None:
+    """At 1000 Hz a surface known to 4 mm shows the side late: followed for eight samples, a state is 150 sigma off."""
+    for ball in bounced(20, SEED, NOISE, 1000.0):
+        online = Online(MODEL, SURFACES, settings_of(NOISE))
+        told = [online.push(t, p) for t, p in zip(ball.track.times.tolist(), ball.track.positions, strict=True)]
+        near = range(ball.first - both_sides.BEFORE, len(told))
+        off = [np.abs(told[k].state - ball.truth[k])[: VZ + 1] / told[k].sigmas[: VZ + 1] for k in near]
+        assert np.max(off) < 8.0
+
+
 @pytest.fixture(scope="module")
 def doubtful() -> Bounced:
     """A ball of which the smoother does not know the side at the end of a track."""
