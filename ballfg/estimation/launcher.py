@@ -110,6 +110,14 @@ def group_spin(spins: SpinPopulation, track: Track, group: str | None) -> SpinLa
     return SpinLabel(mean @ axes, np.sqrt(variances), vectors.T @ axes, measured=False)
 
 
+def undirected_spin(spins: SpinPopulation, group: str | None) -> SpinLabel:
+    """The spin of a group's new shot before its direction shows: turned about the vertical by any angle."""
+    mean, covariance = spins.spin(group)
+    moment = covariance + np.outer(mean, mean)
+    level = (moment[0, 0] + moment[1, 1]) / 2.0
+    return SpinLabel(mean * (0.0, 0.0, 1.0), np.sqrt([level, level, covariance[2, 2]]), measured=False)
+
+
 def launch_velocity(track: Track) -> NDArray[np.float64]:
     """(3,) m/s, mean of a track's first samples."""
     first = slice(0, FIRST_SAMPLES)

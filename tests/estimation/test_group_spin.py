@@ -94,12 +94,26 @@ def test_the_group_makes_a_prediction_better() -> None:
     assert errors[0] < 0.7 * errors[1]
 
 
+def test_a_stream_has_the_spin_of_its_group_turned_by_any_angle_before_its_direction_shows() -> None:
+    online, known = Online(MODEL, TABLE, settings(group="ann")), SPINS.groups["ann"]
+    state = online.push(0.0, START[:3])
+    across = np.sqrt((known.mean[0] ** 2 + known.mean[1] ** 2 + known.sigma[0] ** 2 + known.sigma[1] ** 2) / 2.0)
+    np.testing.assert_allclose(state.state[SPIN], [0.0, 0.0, known.mean[2]], atol=1e-3)
+    np.testing.assert_allclose(state.sigmas[SPIN], [across, across, known.sigma[2]], rtol=0.01)
+    slow = [online.push(0.001 * k, START[:3] + 0.001 * k * START[3:]) for k in range(1, 4)]  # at most 15 mm
+    assert all(one.sigmas[SPIN][0] > 0.99 * across for one in slow)
+
+
 def test_a_stream_has_the_spin_of_its_group_once_its_direction_shows() -> None:
     track = shot("ann", 14)
     online = Online(MODEL, TABLE, settings(group="ann"))
     states = [online.push(t, x) for t, x in zip(track.times, track.positions, strict=True)]
     axes, known = launch_axes(START[3:]), SPINS.groups["ann"]
-    assert np.linalg.norm(axes @ states[8].state[SPIN] - known.mean) > 80.0
+    for state in states[1:9]:
+        covariance = axes @ state.covariance[SPIN, SPIN] @ axes.T
+        away = axes @ state.state[SPIN] - known.mean
+        assert np.abs(away).max() < 12.0
+        assert away @ np.linalg.solve(covariance, away) < 12.0
     for state in states[9:]:
         np.testing.assert_allclose(axes @ state.state[SPIN], known.mean, atol=5.0)
     whole = Online(MODEL, TABLE, settings(group="ann")).estimate(track)

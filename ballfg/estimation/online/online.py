@@ -17,7 +17,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
-from ballfg.estimation.launcher import FIRST_SAMPLES, group_spin
+from ballfg.estimation.launcher import FIRST_SAMPLES, SpinLabel, group_spin, undirected_spin
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
@@ -45,6 +45,8 @@ from ballfg.vision.camera import Camera
 
 LAG = 128
 """States that stay when the window is cut: 0.7 s at 180 Hz; new samples carry no information on older ones."""
+SHOWN: Final = 20.0
+"""Horizontal way of a ball, in standard deviations of a position, from which on its direction is known to 4 degrees."""
 EARLIER: Final[Mapping[str, Solver]] = {"isam2": "gtsam", "chain": "ballfg"}
 """Earlier names of solvers as an argument of `Online`."""
 
@@ -106,6 +108,7 @@ class Online(Estimator):
         self.window: StreamWindow | None = None
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
+        self._undirected: SpinLabel | None = None  # prior of the spin until the launch shows its direction
         self._monitor: ContactMonitor | None = None  # of the window's ball
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
@@ -213,6 +216,8 @@ class Online(Estimator):
         self._tell_whole_error(sample)
         changed = self.events.push(sample.time, sample.position, sample.whole)  # also checks the numbers
         if self.window is None:
+            if sample.label is None and self.settings.spins is not None:
+                sample.label = self._undirected = undirected_spin(self.settings.spins, self.settings.group)
             self.window = self._new_window(sample)
         self._counts[:] = 0
         before = self.window.newest_in_order if len(self.window) else None
@@ -294,10 +299,10 @@ class Online(Estimator):
         moved = move_contacts(window, self._samples, self.events)
         if moved:
             self._append(window, *moved)
-        spins, begun = self.settings.spins, window.first == 0 and len(self._samples) == FIRST_SAMPLES
-        if spins is not None and begun and self._samples[0].label is None:  # the direction of the launch shows now
+        if window.first == 0 and self._undirected is not None and self._launch_shows():
+            assert self.settings.spins is not None
             launch = Track(*path_of(self._samples), name="stream", part=True)
-            self._samples[0].label = group_spin(spins, launch, self.settings.group)
+            self._samples[0].label = group_spin(self.settings.spins, launch, self.settings.group)
             update = window.start_anew(self._samples)
         if len(window) > 2 * self.lag:
             if self._frozen is not None:
@@ -305,6 +310,15 @@ class Online(Estimator):
             window.shorten(self.lag)
             self._samples = list(window.samples)
         return max(len(again), len(moved)), update
+
+    def _launch_shows(self) -> bool:
+        """Whether the direction of the launch is known for the first time, or is final with this sample."""
+        first, last = self._samples[0], self._samples[-1]
+        if len(self._samples) >= FIRST_SAMPLES:
+            self._undirected = None
+            return True
+        way, spread = (last.position - first.position)[:2], max(first.sigma[:2].max(), last.sigma[:2].max())
+        return first.label is self._undirected and float(np.hypot(*way)) > SHOWN * float(spread)
 
     def _append(self, window: StreamWindow, *samples: Sample) -> Update:
         update = window.append_all(samples)
