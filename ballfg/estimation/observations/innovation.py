@@ -12,6 +12,7 @@ from ballfg.factors.linear.step import weighted
 from ballfg.state import POSITION, STATE_DIM
 
 LEAST_INFORMATION = 1e-6  # Least share of the posterior's information that the other measurements get
+LEAST_JUDGED = 20  # Least number of measurements whose scatter is compared with what they state
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,22 @@ class FilterInnovation:
         innovation = whitened(-residual, spread + unit)
         (weight,) = factor.loss.weight(np.array([np.linalg.norm(innovation)]))
         return cls(residual, H, unit / weight, spread, innovation)
+
+
+def scatter(innovations: Array) -> float:
+    """How far measurements lie from their predictions, in what they and these state; 1 if both are right.
+
+    The median counts, so that outliers do not.
+
+    Args: innovations: (m, dim) whitened.
+    Returns: NaN for fewer than `LEAST_JUDGED`.
+    """
+    from scipy import special  # it takes a tenth of a second to import
+
+    squares = np.square(innovations[np.isfinite(innovations).all(axis=1)]).sum(axis=1)
+    if len(squares) < LEAST_JUDGED:
+        return float("nan")
+    return float(np.sqrt(np.median(squares) / special.chdtri(innovations.shape[1], 0.5)))
 
 
 def leave_position_out(states: Array, covariances: Array, measured: Array, noise: Array, samples: Rows) -> Array:

@@ -6,7 +6,7 @@ Estimators know this interface only. A user's own kind of measurement is a subcl
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -17,7 +17,8 @@ from ballfg.arrays import Array, Index
 from ballfg.checks import check_each, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.innovation import leave_one_out
+from ballfg.estimation.measurement.position_noise import MOST_SCATTER
+from ballfg.estimation.observations.innovation import leave_one_out, scatter
 from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch, Rows, Values
@@ -75,6 +76,7 @@ class Observation(ABC):
         file: name of its table in the folder of a dataset; None without a table of its own.
         columns: of that table, beside `trajectory`, `t` (s) and `sigma`.
         largest: largest possible size of a value, in the units of the columns; larger ones are refused.
+        causes: what to check if measurements lie too far from the motion.
         one_view: True if it locates the ball from one point alone, so that the depth comes from the motion.
     """
 
@@ -83,6 +85,7 @@ class Observation(ABC):
     file: ClassVar[str | None] = None
     columns: ClassVar[tuple[str, ...]] = ()
     largest: ClassVar[float] = np.inf
+    causes: ClassVar[str] = "their stamps, places and sigma"
     one_view: bool = False
     state: Index
 
@@ -163,8 +166,22 @@ class Observation(ABC):
         return []
 
     def judged(self, estimate: "Estimate") -> "Estimate":
-        """The estimate of its track, with a status that says what the observation leaves open; by default nothing."""
-        return estimate
+        """The estimate of its track, with a status that says what the observation leaves open.
+
+        By default it gets a note where measurements contradict each other and the motion by far more than they state.
+        """
+        far = scatter(estimate.innovations[self.name])
+        if not far > MOST_SCATTER:
+            return estimate
+        note = (
+            f"the measurements '{self.name}' lie {far:.2g} times as far from the motion as they state"
+            f"{self._parts(estimate)}: covariances are too small. Check {self.causes}."
+        )
+        return replace(estimate, notes=(*estimate.notes, note))
+
+    def _parts(self, estimate: "Estimate") -> str:
+        """The same figure of each source of the measurements, in brackets; by default nothing."""
+        return ""
 
     def onto(self, old: Track, new: Track) -> "Observation":
         """The same measurements on a track of the same ball with other stamps.

@@ -1,6 +1,6 @@
 """Positions are the usual observation of a track."""
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from ballfg.factors.correlated_noise import BiasedPositionFactors
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.position import PositionFactors
 from ballfg.state import STATE_DIM
+
+if TYPE_CHECKING:
+    from ballfg.estimation.result import Estimate
 
 
 class Positions(Observation):
@@ -46,3 +49,7 @@ class Positions(Observation):
             return leave_one_out(rows, covariances)
         noise = context.sigma[:, :, None] ** 2 * np.eye(3)
         return leave_position_out(values.states, covariances.states, self.positions, noise, rows)
+
+    def judged(self, estimate: "Estimate") -> "Estimate":
+        """The estimate: `noise_doubts` has looked at the positions themselves, beside any motion."""
+        return estimate

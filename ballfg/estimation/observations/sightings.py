@@ -15,6 +15,7 @@ from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_code import LAWS
 from ballfg.estimation.observations.bounced_path import place_prior
+from ballfg.estimation.observations.innovation import scatter
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
 from ballfg.estimation.observations.one_view import OneView, bounced_at, one_view
 from ballfg.estimation.observations.ray_path import Rays, determined, filled, rough_path
@@ -76,6 +77,7 @@ class CameraSightings(Observation):
 
     name: ClassVar[str] = "sighting"
     locates: ClassVar[bool] = True
+    causes: ClassVar[str] = "the cameras' clocks, poses and sigmas"
 
     sightings: Sightings
     cameras: tuple[Camera, ...]
@@ -224,6 +226,7 @@ class CameraSightings(Observation):
 
     def judged(self, estimate: Estimate) -> Estimate:
         """The estimate, with the status `DEPTH_UNCERTAIN` if one camera saw the ball and its depth is loose."""
+        estimate = super().judged(estimate)
         if not self.one_view or estimate.status is not Status.OK:
             return estimate
         first = np.searchsorted(self.state, np.arange(len(estimate)))
@@ -234,6 +237,13 @@ class CameraSightings(Observation):
         sigma = np.sqrt(np.einsum("ni,nij,nj->n", rays, estimate.covariances[:, POSITION, POSITION], rays))
         loose = np.median(sigma) > LOOSE_DEPTH or np.median(sigma / distance) > LOOSE_SHARE
         return replace(estimate, status=Status.DEPTH_UNCERTAIN) if loose else estimate
+
+    def _parts(self, estimate: Estimate) -> str:
+        seen, found = estimate.innovations[self.name], self.sightings.camera
+        if len(self.cameras) == 1:
+            return ""
+        each = ((camera.name, scatter(seen[found == number])) for number, camera in enumerate(self.cameras))
+        return f" ({', '.join(f'{shown(name)}: {far:.2g}' for name, far in each if np.isfinite(far))})"
 
     def segmentation(self) -> Segmentation | None:
         """The bounces of a track that one camera saw; None if the positions show the events."""

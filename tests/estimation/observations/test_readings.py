@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -173,6 +175,18 @@ def test_all_estimators_agree_at_the_newest_sample_and_know_the_speed_better(del
 def speed_sigma(estimate) -> float:
     direction = estimate.states[-1, 3:6] / np.linalg.norm(estimate.states[-1, 3:6])
     return float(np.sqrt(direction @ estimate.covariances[-1, 3:6, 3:6] @ direction))
+
+
+def test_readings_beyond_what_they_state_are_noted() -> None:
+    """Errors of three stated sigmas in turns to either side; the right ones say nothing."""
+    track = with_speeds(3, samples=40)
+    (speeds,) = track.observations
+    assert isinstance(speeds, RadarSpeed)
+    one = Smoother(gravity_model(), NOWHERE, PLAIN)
+    assert one.estimate(track).notes == ()
+    shifted = speeds.values + 3.0 * SPEED_SIGMA * (-1.0) ** np.arange(len(speeds))[:, None]
+    (note,) = one.estimate(without(track).observed(RadarSpeed(speeds.state, shifted, SPEED_SIGMA))).notes
+    assert re.match(r"the measurements 'speed' lie [\d.]+ times as far", note)
 
 
 @pytest.mark.parametrize("sort", [Smoother, pytest.param(Online, marks=pytest.mark.thorough), ExtendedKalmanFilter])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,8 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
 from ballfg.tracks import Track
 from ballfg.tracks.sightings import Sightings
-from tests.estimation.observations.sighted_rig import NOISE, RIG, Scene, World, scene, seen, track_of, world
+from ballfg.vision.camera import Camera
+from tests.estimation.observations.sighted_rig import NOISE, RIG, Scene, World, late, scene, seen, track_of, world
 
 
 @pytest.fixture(scope="module")
@@ -231,6 +233,17 @@ def test_a_wrong_candidate_moves_no_state(ball: World, made: Scene) -> None:
     assert moved[away].max() < 0.35
     assert moved[120].max() < 1.0  # its own camera says nothing of it now
     assert other.nis[120] > 1e3
+
+
+@pytest.mark.parametrize("cameras", [RIG[:2], RIG])
+def test_cameras_that_contradict_each_other_are_noted(ball: World, cameras: tuple[Camera, ...]) -> None:
+    """A clock that is 20 ms late leaves errors of 20 stated sigmas; a right rig says nothing in ten scenes."""
+    for seed in range(10):
+        made = scene(seed, ball, rig=cameras, phases=(0.0, 1 / 3, 2 / 3)[: len(cameras)])
+        assert smoother(ball).estimate(track_of(made, cameras=cameras)).notes == ()
+    wrong = smoother(ball).estimate(track_of(made, cameras=late((0.0, 0.02, 0.0))[: len(cameras)]))
+    (note,) = wrong.notes
+    assert re.search(r"'sighting' lie [\d.]+ times as far.*'left': .*'right': .*Check the cameras' clocks", note)
 
 
 @pytest.mark.parametrize("method", ["ekf", "sliding-window"])
