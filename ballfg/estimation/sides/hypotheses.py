@@ -37,6 +37,8 @@ WIDE_VELOCITY: Final = 1.0
 SLOWEST: Final = 0.3
 """m/s. A ball that falls more slowly makes several small hops between samples, or comes to rest: two hypotheses do not
 describe it."""
+SHORTEST_HOP: Final = 2.0 * SLOWEST / STANDARD_GRAVITY
+"""s. In a shorter interval no ball that two hypotheses describe bounces twice."""
 STEEPEST_FALL: Final = 2.0 * STANDARD_GRAVITY
 """m/s^2, a bound on the downward acceleration; topspin adds to the weight."""
 NODE_SHARE: Final = 2.0 / 3.0
@@ -141,6 +143,19 @@ class HypothesisModel:
         noise = process.flight(np.array([dt])) + process.contact(spans, times[found])
         return self._predicted(balls.selected(found), after[found], jacobian[found], noise, dt)
 
+    def predict_bounces(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
+        """Balls after dt s with one bounce on the way, and with two where they come down again by then."""
+        once = self.predict_bounce(balls, dt, level)
+        if dt < SHORTEST_HOP or not len(once):
+            return once
+        last = once.merged()
+        (gap,), (gradient,) = self.gaps(last.means, level)
+        since = -float(last.means[0, VZ]) / STANDARD_GRAVITY  # s since the ball was highest
+        if not 0.0 < since < dt or gap > FAR * np.sqrt(gradient @ last.covariances[0] @ gradient):
+            return once
+        between = self.predict_bounce(balls, dt - since, level)
+        return GaussianMixture.concatenated([once, self.predict_bounce(between, since, level)])
+
     def _predicted(
         self, balls: GaussianMixture, after: Array, jacobian: Array, noise: Array, dt: float
     ) -> GaussianMixture:
@@ -211,7 +226,7 @@ class ContactHypotheses:
         """The hypotheses dt s later, after a measurement."""
         weights = self._above.log_weights  # of the parts above the surface; the Gaussians stay whole
         still = replace(self.flying, log_weights=weights[:1])
-        bouncing = self.model.predict_bounce(_at_nodes(still), dt, self.level)
+        bouncing = self.model.predict_bounces(_at_nodes(still), dt, self.level)
         flying = [self.flying]
         if len(self.bounced):
             flying.append(replace(self.bounced, log_weights=weights[1:]).merged())

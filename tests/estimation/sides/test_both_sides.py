@@ -34,8 +34,8 @@ def test_the_first_state_after_a_bounce_is_honest(name: str) -> None:
 
 
 def test_sides_are_followed_until_they_are_clear_at_a_high_rate() -> None:
-    """At 1000 Hz a surface known to 4 mm shows the side late: followed for eight samples, a state is 150 sigma off."""
-    for ball in bounced(20, SEED, NOISE, 1000.0):
+    """At 1000 Hz a surface known to 4 mm shows it late: after eight samples alone three balls are 150 sigma off."""
+    for ball in bounced(8, SEED, NOISE, 1000.0):
         online = Online(MODEL, SURFACES, settings_of(NOISE))
         told = [online.push(t, p) for t, p in zip(ball.track.times.tolist(), ball.track.positions, strict=True)]
         near = range(ball.first - both_sides.BEFORE, len(told))
