@@ -16,6 +16,7 @@ MIN_POINTS: Final = 4  # three points have up to four poses
 FLAT: Final = 0.01  # share of the points' extent: points closer to a line or plane count as lying in it
 MAX_RMS: Final = 4.0  # multiple of the pixels' sigma: with larger residuals a point has a wrong name or place
 CLEARLY: Final = 9.0  # least excess of the second best pose, in sums of squared whitened residuals: three sigmas
+_HALF_TURNS: Final = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64)
 _REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
@@ -73,7 +74,7 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
     if best.rms > (most := MAX_RMS * marked.sigma):
         problem = f"{where}: points must be explained within {most:g} px; got {best.rms:.1f}"
         raise ValueError(f"{problem}. {_culprit(best)}Check names and pixels, and that the lens is this camera's.")
-    alike = [camera for camera in above[1:2] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
+    alike = [camera for camera in above[1:] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
     if any(np.linalg.norm(above[0].centre - c.centre) > FLAT * np.linalg.norm(above[0].tvec) for c in alike):
         problem = f"{where}: points must tell one pose; two explain them alike"
         raise ValueError(f"{problem}. Mark more points, farther apart or at other heights.")
@@ -103,12 +104,9 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
 def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
     points, pixels = np.ascontiguousarray(marked.points), np.ascontiguousarray(marked.pixels)
     given = (points, pixels, lens.matrix, lens.distortion)
-    method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
     try:
-        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(*given, flags=method)
         refined = [
-            cv2.solvePnPRefineLM(*given, rvec.copy(), tvec.copy(), criteria=_REFINE)
-            for rvec, tvec in zip(rvecs, tvecs, strict=True)
+            cv2.solvePnPRefineLM(*given, rvec, tvec, criteria=_REFINE) for rvec, tvec in _starts(lens, marked, flat)
         ]
     except cv2.error:
         refined = []
@@ -122,6 +120,31 @@ def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
         problem = "points must be explained by some pose; there is none with them all in front of the camera"
         raise ValueError(f"camera {shown(lens.name)}: {problem}. Check which point is which.")
     return cameras
+
+
+def _starts(lens: Camera, marked: Marked, flat: bool) -> list[tuple[Array, Array]]:
+    """Rotation vectors and translations to refine.
+
+    OpenCV's IPPE needs a flat target in the plane z = 0, and returns a wrong vector for a rotation by nearly half a
+    turn. It gets the points in the target's own axes, and in these after half a turn about each of them: whatever the
+    pose, one of the four rotations is at most 120 degrees.
+    """
+    given = (marked.pixels.copy(), lens.matrix, lens.distortion)
+    mean = marked.points.mean(axis=0)
+    if not flat:
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(marked.points.copy(), *given, flags=cv2.SOLVEPNP_SQPNP)
+        return [(np.asarray(rvec), np.asarray(tvec)) for rvec, tvec in zip(rvecs, tvecs, strict=True)]
+    own = np.linalg.svd(marked.points - mean)[2]
+    own[2] *= np.linalg.det(own)  # a rotation, no mirror
+    starts = []
+    for signs in _HALF_TURNS:
+        axes = signs[:, None] * own
+        plane = (marked.points - mean) @ axes.T * (1.0, 1.0, 0.0)
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(plane, *given, flags=cv2.SOLVEPNP_IPPE)
+        for rvec, tvec in zip(rvecs, tvecs, strict=True):
+            turn = cv2.Rodrigues(rvec)[0] @ axes
+            starts.append((cv2.Rodrigues(turn)[0], tvec - turn @ mean[:, None]))
+    return starts
 
 
 def _squares(camera: Camera, marked: Marked) -> float:

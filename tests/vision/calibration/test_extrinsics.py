@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 
 import cv2
@@ -54,6 +55,28 @@ def test_a_planted_pose_comes_back(place: tuple[float, float, float]) -> None:
         np.testing.assert_allclose(found.camera.centre, place, atol=1e-6)
         np.testing.assert_allclose(turned(camera, found.camera), 0.0, atol=1e-6)
         assert found.rms < 1e-4
+
+
+@pytest.mark.parametrize("place", [(-6, 0, 2), (8.74, 0, 2), (7, 3, 2.5), (-25, 0, 6), (1.37, 5, 2), (1.37, -5, 2)])
+def test_the_order_of_points_is_free(place: tuple[float, float, float]) -> None:
+    """All orders of four corners and some of six points, exact, from places that look along the table or across it."""
+    camera, rng = standing(place), np.random.default_rng(0)
+    six = tuple(name for name in AT if "middle" not in name)
+    orders = [*permutations(CORNERS), six, six[::-1], *(tuple(rng.permutation(six)) for _ in range(10))]
+    for names in orders:
+        found = calibrate_extrinsics(camera, marked(camera, names))
+        np.testing.assert_allclose(found.camera.centre, place, atol=1e-5)
+        assert found.rms < 1e-4
+
+
+@pytest.mark.parametrize("place", [(7, 3, 2.5), (8.74, 0, 2)])
+def test_a_wrong_point_is_named_in_any_order(place: tuple[float, float, float]) -> None:
+    camera = standing(place)
+    for names in (tuple(AT), tuple(sorted(AT)), tuple(AT)[::-1]):
+        seen = marked(camera, names)
+        seen.pixels[names.index("net_left")] += (60, -20)
+        with pytest.raises(ValueError, match=r"Without 'net_left' the others agree\."):
+            calibrate_extrinsics(camera, seen)
 
 
 @pytest.mark.parametrize("place", PLACES[:3])
