@@ -51,10 +51,10 @@ def find_tracklets(detections: Detections, focal: float) -> list[Index]:
     open_pieces: list[_Piece] = []
     done: list[_Piece] = []
     recent: list[list[_Seen]] = []
-    for number, candidates in enumerate(_frames(detections)):
-        recent = [*recent, candidates][-4:]
-        if not candidates:
-            continue
+    last = -1
+    for number, candidates in _frames(detections):
+        lost = min(number - last - 1, MAX_MISSED)
+        recent, last = [*recent, *([] for _ in range(lost)), candidates][-(MAX_MISSED + 1) :], number
         done += [piece for piece in open_pieces if number - piece.seen[-1].frame > MAX_MISSED + 1]
         open_pieces = [piece for piece in open_pieces if number - piece.seen[-1].frame <= MAX_MISSED + 1]
         _offer(open_pieces, candidates, focal)
@@ -65,15 +65,20 @@ def find_tracklets(detections: Detections, focal: float) -> list[Index]:
     return sorted(moving, key=lambda piece: int(piece[0]))
 
 
-def _frames(detections: Detections) -> list[list[_Seen]]:
+def _frames(detections: Detections) -> list[tuple[int, list[_Seen]]]:
+    """The frames with candidates, and their numbers, which count frames that are missing too."""
+    steps = np.diff(detections.frames)
+    # A table of a clean detector has no row of a frame without a ball: time tells how many frames lie between.
+    counted = np.maximum(np.rint(steps / np.median(steps)), 1.0) if len(steps) else steps
+    numbers = np.concatenate(([0], np.cumsum(counted)))[: len(detections.frames)].astype(np.int64).tolist()
     frames: list[list[_Seen]] = [[] for _ in detections.frames]
     variances = np.maximum(np.trace(detections.covariances, axis1=1, axis2=2) / 2.0, _LEAST_VARIANCE)
     costs = _SCORE_COST * (1.0 - detections.scores)
     columns = (detections.frame, detections.times, detections.pixels, variances, costs)
-    numbers = zip(*(column.tolist() for column in columns), strict=True)
-    for row, (frame, time, (u, v), variance, cost) in enumerate(numbers):
-        frames[frame].append(_Seen(row, frame, time, u, v, variance, cost))
-    return frames
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    for row, (frame, time, (u, v), variance, cost) in enumerate(rows):
+        frames[frame].append(_Seen(row, numbers[frame], time, u, v, variance, cost))
+    return [(number, seen) for number, seen in zip(numbers, frames, strict=True) if seen]
 
 
 def _offer(pieces: list[_Piece], candidates: list[_Seen], focal: float) -> None:

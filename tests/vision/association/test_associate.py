@@ -110,6 +110,26 @@ def hidden(seen: Detections, start: float, end: float) -> Detections:
     return seen.select((seen.times < start) | (seen.times > end))
 
 
+@pytest.mark.parametrize("apart", [0.0, 0.5, 9.0, 60.0])
+def test_frames_without_a_row_count_as_those_with_a_weak_candidate(apart: float) -> None:
+    """A clean detector writes nothing where there is no ball: flights some time apart are not one ball."""
+    world = World(shots(3, np.random.default_rng(4)), 3.2, phases=(0.0, 0.0, 0.0), missed=0.0, clutter=0, arm=False)
+    clean, weak = [], []
+    for seen, more in zip(film(CAMERAS, world), film(CAMERAS, replace(world, clutter=1)), strict=True):
+        stamps = seen.frames + apart * np.floor(seen.frames)
+        kept, frame = np.unique(seen.frame, return_inverse=True)
+        clean.append(replace(seen, frames=stamps[kept], frame=frame))
+        scores = np.where(np.isin(more.pixels[:, 0], seen.pixels[:, 0]), 1.0, 0.1)
+        weak.append(replace(more, frames=stamps, scores=scores))
+    found, other = associate(clean, CAMERAS), associate(weak, CAMERAS)
+    starts = [shot.start + apart * k for k, shot in enumerate(world.shots)]
+    np.testing.assert_allclose([ball.times[0] for ball in found], starts, atol=0.02)
+    assert all(np.diff(ball.times).max() < 0.02 for ball in found)
+    for one, same in zip(found, other, strict=True):
+        np.testing.assert_allclose(one.times, same.times, atol=1e-9)
+        np.testing.assert_allclose(one.points, same.points, atol=1e-9)
+
+
 def test_an_arm_is_no_ball_and_neither_is_clutter() -> None:
     films = film(CAMERAS, World([], 3.0, clutter=6))
     assert associate(films, CAMERAS) == []
