@@ -189,12 +189,14 @@ class CameraSightings(Observation):
         return self._in_place(track, replace(self, sightings=noisy, cameras=exact))
 
     def loosened(self, track: Track) -> Track | None:
-        """The track with the error of a start's laws added to the noise of one camera's pixels, if that is smaller."""
+        """The track with the error of a start's laws added to the noise of its pixels, if that is smaller."""
         if not self.one_view or self.known is not None:
             return None
-        seen, (camera,) = self.sightings, (self.cameras[number] for number in np.unique(self.sightings.camera))
-        points = seen.from_cameras(track.positions[self.state])
-        spread = (LAWS / camera.depth(points)[:, None] * np.diag(camera.matrix)[:2]) ** 2
+        seen = self.sightings
+        points, spread = seen.from_cameras(track.positions[self.state]), np.empty((len(seen), 2))
+        for number in np.unique(seen.camera):  # several, where one saw the ball after the other
+            camera, mine = self.cameras[number], seen.camera == number
+            spread[mine] = (LAWS / camera.depth(points[mine])[:, None] * np.diag(camera.matrix)[:2]) ** 2
         if np.median(spread) < np.median(np.trace(seen.covariances, axis1=1, axis2=2)) / 2.0:
             return None
         noisy = replace(seen, covariances=seen.covariances + spread[:, :, None] * np.eye(2))

@@ -125,6 +125,28 @@ def test_states_and_bounces_against_the_truth(ball: World) -> None:
     assert np.mean(inside) > 0.84
 
 
+@pytest.mark.parametrize("gap", [0, 2])
+def test_one_camera_sees_the_ball_after_the_other(ball: World, gap: int) -> None:
+    """Handed over in mid-flight, or with frames between that nobody saw: errors as one camera's, within the sigmas."""
+    surfaces = replace(ball.surfaces, extent=(-1.37, 1.37, -0.76, 0.76))
+    rig = [SIDE, looking("oblique", (-3.0, -3.0, 2.5))]
+    estimator, errors, inside = Smoother(ball.model, surfaces), [], []
+    for seed in range(8):
+        times, states = stroke(ball, seed)
+        kept = np.r_[:8, 8 + gap : len(times)]
+        pixels = [pixels_of(states[:, :3], times, camera, 0.5, seed).pixels for camera in rig]
+        camera = np.where(kept < 8, 0, 1)
+        spread = np.tile(0.25 * np.eye(2), (len(kept), 1, 1))
+        seen = Sightings(("side", "oblique"), camera, times[kept], np.stack(pixels)[camera, kept], spread)
+        found = estimator.estimate(sighted_track("a", seen, rig))
+        assert found.status is Status.OK
+        error = found.states[:, :3] - states[kept, :3]
+        errors.append(np.sqrt((error**2).sum(axis=1).mean()))
+        inside.append((np.abs(error) < 1.645 * found.sigmas[:, :3]).mean())
+    assert np.median(errors) < 0.03
+    assert np.mean(inside) > 0.84
+
+
 def test_the_balls_radius_shows_its_depth(ball: World) -> None:
     """Radii known to 0.05 px at 4.5 m, beside pixels of 2 px, lower the errors."""
     estimator, errors = Smoother(ball.model, ball.surfaces), []
