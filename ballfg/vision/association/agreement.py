@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from ballfg.arrays import Array
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.association.paths import path
-from ballfg.vision.association.triangulate import triangulate
+from ballfg.vision.association.triangulate import HOPELESS, MAX_SIGMA, triangulate
 from ballfg.vision.calibration.intrinsics import POSE, slopes_of
 from ballfg.vision.camera import Camera
 
@@ -30,8 +30,11 @@ _LOOSE: Final = 20.0  # px, noise for points from views that may be wrong
 _UNSEEN: Final = 1e4  # px, error of a sighting whose point lies behind the camera or beyond its lens
 _FAR: Final = 9.0  # median squared errors at which a point counts half
 _STEPS: Final = 8  # Gauss-Newton steps; a camera turned by five degrees is right after six
-_PRIOR: Final = np.diag([0.1**-2] * 3 + [0.3**-2] * 3)
-"""Information about a nudge, 0.1 rad of turn and 0.3 m of shift: keeps the fit in place where points are too few."""
+_TURNED, _SHIFTED = 0.1, 0.3  # rad, m: standard deviations of a nudge
+_PRIOR: Final = np.diag([_TURNED**-2] * 3 + [_SHIFTED**-2] * 3)
+"""Information about a nudge: keeps the fit in place where points are too few."""
+LARGEST_MOVE: Final = 2.0  # of these standard deviations: what needs more is no nudge, but a wrong clock, name or place
+LEAST_SHARE: Final = 0.25  # least share of the points at which a camera that was nudged saw the ball
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Agreement:
     """The agreement of calibrated cameras on the balls that they saw."""
 
     culprit: str | None
-    """The one camera whose correction explains the disagreement; None if they agree or if no single one does."""
+    """The one camera whose small move explains the disagreement; None if they agree or if no single one does."""
     by_camera: Mapping[str, CameraAgreement]
     """By name, in the rig's order; empty where too little was seen by three cameras."""
     misfit: float
@@ -68,6 +71,7 @@ class _Scene:
     weights: Array  # (n, c, 2, 2) inverse covariances; zero where not seen
     points: Array  # (n, 3) m, first guess
     expected: Array  # (n,) median of the squared error that noise alone makes
+    shares: Array  # (c,) of all points, of two cameras too, the share at which each camera saw the ball
 
 
 def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agreement:
@@ -95,8 +99,14 @@ def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agr
             float(np.linalg.norm(corrected[k].centre - camera.centre)),
             _against_others(scene, corrected, k),
         )
-    culprit = _culprit(by_camera, before) if before > LEAST_MISFIT else None
-    return Agreement(culprit, by_camera, before, _sentence(culprit, by_camera, before))
+    suspect = _culprit(by_camera, before) if before > LEAST_MISFIT else None
+    shares = dict(zip(by_camera, scene.shares.tolist(), strict=True))
+    moved = suspect is not None and _may_have_moved(by_camera[suspect], shares[suspect])
+    rare = min(shares, key=lambda name: shares[name])
+    if suspect is not None and not moved and shares[rare] < LEAST_SHARE:  # few points are fitted by any camera's pose
+        suspect = rare
+    sentence = _sentence(suspect, by_camera, before, moved=moved)
+    return Agreement(suspect if moved else None, by_camera, before, sentence)
 
 
 def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
@@ -121,13 +131,15 @@ def _scene(balls: Sequence[SeenBall], cameras: list[Camera]) -> _Scene:
     rows, points = rows[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
     weights = np.zeros(covariances[rows].shape)
     weights[seen[rows]] = np.linalg.inv(covariances[rows][seen[rows]])
-    return _Scene(pixels[rows], weights, points, chi2.median(2 * seen[rows].sum(axis=1) - 3))
+    shares = seen.sum(axis=0) / max(len(seen), 1)
+    return _Scene(pixels[rows], weights, points, chi2.median(2 * seen[rows].sum(axis=1) - 3), shares)
 
 
 def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:
     """(n, c, 2) px, seen minus projected; zero where not seen, `_UNSEEN` for an impossible sighting."""
     projected = np.stack([camera.project(points) for camera in cameras], axis=1)
-    return np.where(np.isnan(scene.pixels), 0.0, np.nan_to_num(scene.pixels - projected, nan=_UNSEEN))
+    errors = np.clip(np.nan_to_num(scene.pixels - projected, nan=_UNSEEN), -_UNSEEN, _UNSEEN)
+    return np.where(np.isnan(scene.pixels), 0.0, errors)
 
 
 def _misfit(scene: _Scene, cameras: list[Camera], points: Array) -> float:
@@ -142,14 +154,13 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
     start = np.concatenate((first.rvec, first.tvec))
     for _ in range(_STEPS):
         errors = _errors(scene, cameras, points)
-        slopes = [slopes_of(c, points, c.rvec, c.tvec)[:, :POSE].reshape(-1, 2, POSE) for c in cameras]
-        by_point = np.stack([pose[..., 3:] @ camera.rotation for pose, camera in zip(slopes, cameras, strict=True)], 1)
+        slopes, by_point, information = _slopes(scene, cameras, points, errors)
         weighted = scene.weights @ by_point
-        information = np.einsum("ncij,ncik->njk", by_point, weighted)
         gradient = np.einsum("ncij,nci->nj", weighted, errors)
         points = points + np.linalg.solve(information, gradient[..., None])[..., 0]
         if nudged is not None:
-            by_pose, mine = slopes[nudged], scene.weights[:, nudged] @ slopes[nudged]
+            by_pose = slopes[:, nudged]
+            mine = scene.weights[:, nudged] @ by_pose
             mixed = np.einsum("nij,nik->njk", weighted[:, nudged], by_pose)
             removed = np.linalg.solve(information, mixed)
             # Cauchy weights: points far worse than the median count less
@@ -165,6 +176,25 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
             pose = pose + change
             cameras[nudged] = replace(cameras[nudged], rvec=pose[:3], tvec=pose[3:])
     return points, cameras
+
+
+def _slopes(scene: _Scene, cameras: list[Camera], points: Array, errors: Array) -> tuple[Array, Array, Array]:
+    """Slopes of the pixels by the poses (n, c, 2, 6) and by the points (n, c, 2, 3), and the points' information.
+
+    Slopes are zero for impossible sightings, and for points that have run away, which the others hold nowhere: these
+    stay where they are, with their misfit, and move no camera. Their information (n, 3, 3) is that of one.
+    """
+    poses = [slopes_of(c, points, c.rvec, c.tvec)[:, :POSE].reshape(-1, 2, POSE) for c in cameras]
+    possible = np.asarray((np.abs(errors) < _UNSEEN).all(axis=2))
+    slopes = np.where(possible[..., None, None], np.stack(poses, axis=1), 0.0)
+    by_point = slopes[..., 3:] @ np.stack([camera.rotation for camera in cameras])
+    information = np.einsum("ncij,ncik->njk", by_point, scene.weights @ by_point)
+    lost = np.asarray(~np.isfinite(information).all(axis=(1, 2)))
+    information[lost] = 0.0
+    least, _, most = np.linalg.eigvalsh(information).T
+    lost |= (least * MAX_SIGMA**2 <= HOPELESS) | (least <= HOPELESS**2 * most)
+    slopes[lost], by_point[lost], information[lost] = 0.0, 0.0, np.eye(3)
+    return slopes, by_point, information
 
 
 def _against_others(scene: _Scene, cameras: list[Camera], k: int) -> float:
@@ -184,7 +214,13 @@ def _culprit(by_camera: Mapping[str, CameraAgreement], misfit: float) -> str | N
     return ranked[0] if left <= 1.0 - LEAST_EXPLAINED and clear else None
 
 
-def _sentence(culprit: str | None, by_camera: Mapping[str, CameraAgreement], misfit: float) -> str:
+def _may_have_moved(seen: CameraAgreement, share: float) -> bool:
+    """True for a correction as small as a knock makes; a wrong clock or name asks for a large one, or hides balls."""
+    size = np.hypot(np.radians(seen.rotation) / _TURNED, seen.shift / _SHIFTED)
+    return bool(size <= LARGEST_MOVE and share >= LEAST_SHARE)
+
+
+def _sentence(culprit: str | None, by_camera: Mapping[str, CameraAgreement], misfit: float, *, moved: bool) -> str:
     distances = ", ".join(f"{name} {seen.residual:.2f} px" for name, seen in by_camera.items())
     each = f"each from the points of the others by {distances}"
     if misfit <= LEAST_MISFIT:
@@ -193,6 +229,9 @@ def _sentence(culprit: str | None, by_camera: Mapping[str, CameraAgreement], mis
         why = f"The cameras disagree, and no single one explains it ({each})."
         return f"{why} Calibrate them again, and check their time offsets."
     seen = by_camera[culprit]
+    if not moved:
+        problem = f"Camera {culprit} does not fit the others: it is off by {seen.residual:.1f} px from their points"
+        return f"{problem}, and no small move explains it. Check its clock (time_offset), its name and its pose."
     return (
         f"Camera {culprit} has moved since its calibration: it is off by {seen.residual:.1f} px from the points of the "
         f"others, {seen.corrected:.1f} px if turned by {seen.rotation:.2f} degrees and shifted by "

@@ -17,7 +17,7 @@ MISSED: Final = 1e-6  # share of right candidates that the tests may refuse
 MAX_SIGMA: Final = 0.5  # m, standard deviation in the least certain direction, from which rays count as parallel
 _GATES: Final = tuple(float(chi2.isf(MISSED, degrees)) for degrees in (1, 2))  # of two rays, of a further view
 _STEPS: Final = 3  # Gauss-Newton steps; from halfway between two rays the second moves less than a micrometre
-_HOPELESS: Final = 1e-6  # information in 1 / `MAX_SIGMA`^2 below which a normal matrix is singular up to rounding
+HOPELESS: Final = 1e-6  # information in 1 / `MAX_SIGMA`^2 below which a normal matrix is singular up to rounding
 _TINY_ANGLE: Final = 1e-12  # squared sine below which two rays are parallel in float64: halfway between them is nowhere
 _AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])  # px, steps of differences
 
@@ -185,7 +185,7 @@ def _refined(views: _Views, points: Array, used: Mask) -> tuple[Array, Array]:
         information = np.einsum("ncij,ncik->njk", derivatives, weighted)
         gradient = np.einsum("ncij,nci->nj", weighted, residuals)
         solvable = np.isfinite(information).all(axis=(1, 2))
-        solvable[solvable] &= np.linalg.eigvalsh(information[solvable])[:, 0] * MAX_SIGMA**2 > _HOPELESS
+        solvable[solvable] &= np.linalg.eigvalsh(information[solvable])[:, 0] * MAX_SIGMA**2 > HOPELESS
         points[~solvable], spread[~solvable] = np.nan, np.nan
         spread[solvable] = np.linalg.inv(information[solvable])
         points[solvable] -= np.einsum("nij,nj->ni", spread[solvable], gradient[solvable])

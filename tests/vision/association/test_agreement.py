@@ -1,9 +1,11 @@
 """The check of cameras against each other: the one that was nudged is named, and its nudge measured."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ballfg.vision.association.agreement import CameraAgreement, _culprit, check_agreement
+from ballfg.vision.association.agreement import CameraAgreement, _culprit, _may_have_moved, check_agreement
 from ballfg.vision.association.associate import associate
 from ballfg.vision.camera import Camera
 from tests.vision.filming import World, film, rig, shots, turned
@@ -55,6 +57,37 @@ def test_two_wrong_cameras_are_not_blamed_on_one() -> None:
     found = check_agreement(associate(FILMS, cameras), cameras)
     assert found.culprit is None
     assert "no single one explains it" in found.sentence
+
+
+@pytest.mark.parametrize(("seed", "number", "late"), [(1, 0, -0.1), (3, 2, 0.15)])
+def test_a_wrong_clock_is_no_move(seed: int, number: int, late: float) -> None:
+    """No turn by tens of degrees is reported, and points that run away under such a turn end nothing."""
+    films = film(CAMERAS, World(shots(3, np.random.default_rng(seed)), 3.2, seed=seed))
+    films[number] = replace(films[number], frames=films[number].frames + late)
+    balls = associate(films, CAMERAS)
+    found = check_agreement(balls, CAMERAS)
+    assert found.culprit is None
+    assert found.misfit > 100.0
+    name = CAMERAS[number].name
+    assert found.by_camera[name].residual > 20.0
+    assert found.sentence.startswith(f"Camera {name} does not fit the others: it is off by ")
+    assert found.sentence.endswith("Check its clock (time_offset), its name and its pose.")
+
+
+@pytest.mark.parametrize(
+    ("rotation", "shift", "share", "moved"),
+    [
+        (0.5, 0.01, 1.0, True),
+        (8.0, 0.2, 0.3, True),
+        (13.0, 0.0, 1.0, False),
+        (0.5, 0.7, 1.0, False),
+        (0.5, 0.0, 0.2, False),
+    ],
+)
+def test_a_move_is_small_and_of_a_camera_that_saw_the_balls(
+    rotation: float, shift: float, share: float, moved: bool
+) -> None:
+    assert _may_have_moved(CameraAgreement(5.0, 0.95, rotation, shift, 1.0), share) is moved
 
 
 @pytest.mark.parametrize(("explained", "culprit"), [(0.78, None), (0.82, "left"), (0.95, "left")])
