@@ -5,6 +5,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+from scipy.stats import chi2
 
 from ballfg.arrays import Array
 from ballfg.checks import listed, shown
@@ -39,6 +40,12 @@ class Extrinsics:
     def rms(self) -> float:
         """px, root mean square length of the residuals."""
         return _rms(self.residuals)
+
+    @property
+    def chance(self) -> float:
+        """Probability that the noise of the marks alone makes residuals as large as these."""
+        freedom = 2 * len(self.marked.points) - POSE
+        return float(chi2.sf(_squares(self.camera, self.marked), freedom))
 
     @property
     def turn_sigma(self) -> float:

@@ -23,6 +23,7 @@ ARROW: Final = 0.05  # length of a residual of three times the median in the dra
 PARTS: Final = 40  # number of parts of a drawn line, which the lens bends
 PANEL: Final = (5.0, 3.4)  # inches, width and height of a panel
 DPI: Final = 120
+UNLIKELY: Final = 1e-3  # chance of the residuals at table points below which the lens or a point is probably wrong
 IN_A_LINE: Final = 6  # views that a line of the summary names
 
 
@@ -46,6 +47,9 @@ def summary(found: Calibration) -> Iterator[str]:
         x, y, z = place.camera.centre
         errors = zip(place.marked.names, np.linalg.norm(place.residuals, axis=1), strict=True)
         yield f"  place: {len(place.marked.names)} points, RMS {place.rms:.2f} px"
+        if place.chance < UNLIKELY:
+            chance = f"noise of {place.marked.sigma:g} px explains that with a chance of {place.chance:.0e}"
+            yield f"    note: {chance}. {_remedy(place)}"
         yield (
             f"    at ({x:.3f}, {y:.3f}, {z:.3f}) m ± {1e3 * place.centre_sigma:.1f} mm, "
             f"turned ± {np.degrees(place.turn_sigma):.3f} degrees"
@@ -53,6 +57,13 @@ def summary(found: Calibration) -> Iterator[str]:
         if (covariance := place.camera.covariance) is not None:
             yield f"    focal length {place.camera.matrix[0, 0]:.1f} px ± {np.sqrt(covariance[-1, -1]):.1%}"
         yield "    px: " + ", ".join(f"{name} {error:.2f}" for name, error in errors)
+
+
+def _remedy(place: Extrinsics) -> str:
+    """What to do about residuals at table points that noise does not explain."""
+    if place.camera.covariance is not None:  # its focal length was found too
+        return "Check names and pixels."
+    return "Check names and pixels, or find the focal length too, with --focal-sigma 0.05."
 
 
 def _lens_lines(lens: Intrinsics) -> Iterator[str]:

@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest
 
+from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
 from ballfg.vision.calibration.focal import pose_and_focal
+from ballfg.vision.calibration.report import UNLIKELY, Calibration, summary
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_change import ZOOM, changed
-from tests.vision.calibration.test_extrinsics import AT, PLACES, marked, shaken, standing, turned
+from tests.vision.calibration.test_extrinsics import AT, CORNERS, PLACES, marked, shaken, standing, turned
 
 
 def grown(camera: Camera, zoom: float) -> Camera:
@@ -40,6 +42,25 @@ def test_covariances_are_those_of_the_scatter() -> None:
         squares.append(error @ np.linalg.solve(found.covariance, error))
     low, high = chi2.ppf([0.001, 0.999], 7 * 150) / 150
     assert low < np.mean(squares) < high
+
+
+@pytest.mark.parametrize(("names", "off"), [(CORNERS, 0.06), (tuple(AT), 0.04)])
+def test_residuals_beyond_the_noise_are_noted(names: tuple[str, ...], off: float) -> None:
+    """Chances of right lenses are even; a wrong focal length has hardly one, and with its sigma it has again."""
+    camera, rng, chances = standing(PLACES[0]), np.random.default_rng(0), []
+    for _ in range(200):
+        place = calibrate_extrinsics(camera, shaken(marked(camera, names), rng))
+        chances.append(place.chance)
+        assert ("note: " in " ".join(summary(Calibration(place.camera, None, place)))) == (place.chance < UNLIKELY)
+    assert kstest(chances, "uniform").pvalue > 0.01
+    seen = shaken(marked(camera, names), rng)
+    wrong = calibrate_extrinsics(grown(camera, off), seen)
+    assert wrong.rms < 4.0 * seen.sigma
+    assert wrong.chance < 1e-5
+    said = " ".join(summary(Calibration(wrong.camera, None, wrong)))
+    assert "note: noise of 0.5 px explains that with a chance of " in said
+    assert "--focal-sigma 0.05" in said
+    assert pose_and_focal(grown(camera, off), seen, 0.05).chance > 0.01
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.5, np.nan])
