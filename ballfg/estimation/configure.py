@@ -51,6 +51,19 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
     about them. Other noise that the model or, second, the dataset states takes precedence. The model's groups of shots
     give the spin of tracks without a spin label.
     """
+    return _settings(dataset, model, (dataset.info.noise, _own_noise(dataset, model)))
+
+
+def usual_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Settings:
+    """`dataset_settings` without the noise that `dataset.yaml` and the model state: the prior of what tracks show.
+
+    Stated noise may come from the same tracks, which a prior with it would count twice.
+    """
+    return _settings(dataset, model, ())
+
+
+def _settings(dataset: Dataset | SightedDataset, model: BallModel, noises: Sequence[TrackNoise | None]) -> Settings:
+    """The settings with stated noises, of which a later one takes precedence."""
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
         noise = (info.position_noise,) * 3
@@ -74,7 +87,7 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
             settings = replace(settings, spin_label_noise=trained.spin_noise)
     if info.spin_noise is not None:
         settings = replace(settings, spin_label_noise=info.spin_noise)
-    for stated in (info.noise, _own_noise(dataset, model)):
+    for stated in noises:
         settings = settings if stated is None else with_noise(settings, stated)
     if dataset.one_view:  # predictions have one process noise for all tracks
         settings = replace(settings, process=settings.for_track(next(iter(dataset))).process)

@@ -38,6 +38,22 @@ def test_table_and_files(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert status("predict", shots, "--model", out, "--observe", 0.3, "--jobs", 1, "--out", tmp_path / "p.csv") == 0
 
 
+def test_written_noise_is_no_prior_of_the_next_one(shots: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same tracks are counted once, however often the noise is written: a prior of them would move every number."""
+    said, stated = [], []
+    before = (shots / "dataset.yaml").read_bytes()
+    for _ in range(2):
+        assert status("noise", shots, "--model", shots / "model.yaml", "--tracks", 8, "--write") == 0
+        said.append(capsys.readouterr().out)
+        stated.append(read_dataset(shots).info.noise)
+    assert stated[0] == stated[1]
+    tables = [[line for line in lines.splitlines() if "so far" not in line] for lines in said]
+    assert tables[0] == tables[1]
+    found, assumed = re.findall(r"hold (\d+) %; with the noise assumed so far (\d+) %", said[1])[0]
+    assert found == assumed  # what is written counts as assumed
+    (shots / "dataset.yaml").write_bytes(before)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -69,7 +69,8 @@ def noise(
     Example: ballfg noise data/ballgun --out noisy.yaml
     """
     from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
-    from ballfg.estimation.noise.estimate import spread_over
+    from ballfg.estimation.configure import usual_settings
+    from ballfg.estimation.noise.estimate import held_with, spread_over
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
@@ -87,22 +88,19 @@ def noise(
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
     data = inputs.flights_only(data, anyway)
-    found = estimate_noise(
-        ball,
-        dataset_surfaces(data),
-        dataset_settings(data, ball),
-        spread_over(data, len(data), tracks),
-        watch=progress,
-    )
+    surfaces, chosen = dataset_surfaces(data), spread_over(data, len(data), tracks)
+    assumed, usual = dataset_settings(data, ball), usual_settings(data, ball)
+    found = estimate_noise(ball, surfaces, usual, chosen, watch=progress)
     if found is None:
         raise ValueError(f"{dataset} must hold tracks with undisturbed flights of 0.1 s or more; none has one")
     check_known(found, dataset)
     print(f"{dataset}: noise from {found.tracks} tracks, {found.starts} forecasts of up to 0.3 s in them")
     for line in _table(found):
         print(line)
+    before = found.held_before if assumed == usual else held_with(ball, surfaces, assumed, chosen)
     print(
         f"90 % intervals of these forecasts hold {100 * found.held:.0f} %; with the noise assumed so far "
-        f"{100 * found.held_before:.0f} %"
+        f"{100 * before:.0f} %"
     )
     _write(found, data, ball, out, write)
 

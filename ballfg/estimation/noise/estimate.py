@@ -137,15 +137,10 @@ def _searched(
     linear: LinearTracks,
 ) -> NoiseEstimate | None:
     """The noise of linearised parts of tracks; known: its white part, and what the tracker adds."""
-    # from the origins that a robot would use, or earlier ones in tracks that are too short
-    typical = float(np.median([part.duration for part in parts]))
-    earliest, every = min(EARLIEST_START, EARLIEST_SHARE * typical), min(START_EVERY, EVERY_SHARE * typical)
-    biased = settings.has_memory or not known[1]
-    forecaster = Forecaster(linear, settings.velocity_prior, earliest, every, biased=biased)
-    if not len(forecaster.starts):
+    search = _search(parts, settings, known, linear)
+    if not len(search.forecaster.starts):
         return None
-    parameters = parameters_of(settings, linear, *known)
-    search = _Search(forecaster, parameters, settings)
+    parameters = search.parameters
     watched = watch(range(2 * MOST_ITERATIONS), 2 * MOST_ITERATIONS, "steps of the noise")
     with closing(step for step in watched) as steps:
         logs = search.minimised(lambda: next(steps, None))
@@ -163,8 +158,33 @@ def _searched(
         held_before=search.held(search.start),
         held=search.held(logs),
         tracks=len(linear),
-        starts=len(forecaster.starts),
+        starts=len(search.forecaster.starts),
     )
+
+
+def held_with(model: BallModel, surfaces: Surfaces, settings: Settings, tracks: Iterable[Track]) -> float:
+    """The share of forecast coordinates inside their 90 % intervals with a noise, on tracks that show theirs.
+
+    Args: as of `estimate_noise`.
+    """
+    parts = [part for track in tracks if len(part := track.opening(LONGEST_PART)) >= LEAST_SAMPLES]
+    known = (any(part.sigmas is not None for part in parts), False)
+
+    def held(linear: LinearTracks) -> float:
+        search = _search(parts, settings, known, linear)
+        return search.held(search.start)
+
+    linear = linearised(model, surfaces, settings, parts)
+    return math.nan if linear is None else on_one_thread(held, linear)
+
+
+def _search(parts: Sequence[Track], settings: Settings, known: tuple[bool, bool], linear: LinearTracks) -> "_Search":
+    """The search from the origins that a robot would use, or earlier ones in tracks that are too short."""
+    typical = float(np.median([part.duration for part in parts]))
+    earliest, every = min(EARLIEST_START, EARLIEST_SHARE * typical), min(START_EVERY, EVERY_SHARE * typical)
+    biased = settings.has_memory or not known[1]
+    forecaster = Forecaster(linear, settings.velocity_prior, earliest, every, biased=biased)
+    return _Search(forecaster, parameters_of(settings, linear, *known), settings)
 
 
 def _intervals(logs: Array, sides: Array, wide: Array) -> list[tuple[float, float]]:
