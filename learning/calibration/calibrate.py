@@ -26,8 +26,9 @@ from ballfg.estimation import (
     estimate_noise,
 )
 from ballfg.estimation.batch import estimate_tracks, map_tracks
+from ballfg.estimation.configure import usual_settings
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
-from ballfg.estimation.noise.parameters import with_noise
+from ballfg.estimation.noise.parameters import with_medians, with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.registry import make_estimator
 from ballfg.factors.loss import Loss
@@ -267,6 +268,8 @@ def fitted_noise(
 ) -> NoiseEstimate | None:
     """The noise of the fitted tracks about the calibrated model; None if undetermined.
 
+    Stated noise may come from the same tracks, and is not its prior; it counts where these tracks say nothing.
+
     Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
         errors: True to compute error bars, which take several times as long.
     """
@@ -278,14 +281,17 @@ def fitted_noise(
     found = estimate_noise(
         model,
         problem.surfaces,
-        settings,
+        with_medians(settings, usual_settings(problem.dataset, problem.model), position_known=known),
         tracks,
         position_known=known,
         errors=errors,
         watch=watch,
         jobs=problem.jobs,
     )
-    return found if found is None or problem.correction is None else _with_doubts(found, doubt_sigmas(problem.model))
+    if found is None:
+        return None
+    found = replace(found, settings=with_noise(settings, found.noise))
+    return found if problem.correction is None else _with_doubts(found, doubt_sigmas(problem.model))
 
 
 def _with_doubts(found: NoiseEstimate, doubts: dict[str, float]) -> NoiseEstimate:

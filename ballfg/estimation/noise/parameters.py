@@ -120,6 +120,16 @@ def track_noise(parameters: list[Parameter], logs: Array, settings: Settings) ->
     return TrackNoise(**values, coefficients=spreads)  # type: ignore[arg-type]
 
 
+def with_medians(settings: Settings, usual: Settings, *, position_known: bool) -> Settings:
+    """Settings with the usual noise, as the prior medians of all but the coefficients.
+
+    Args: position_known: True to keep the white noise of positions.
+    """
+    names = ["memory", "memory_time", "stamp_jitter", "spin_label_noise", "spin_prior", "process"]
+    names += [] if position_known else ["position_noise", "position_scale"]
+    return replace(settings, **{name: getattr(usual, name) for name in names})
+
+
 def with_noise(settings: Settings, noise: TrackNoise) -> Settings:
     """Settings with a noise.
 

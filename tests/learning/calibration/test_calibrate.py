@@ -12,7 +12,15 @@ import pytest
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Status
 from ballfg.learning.calibration import calibrate as module, run
-from ballfg.learning.calibration.calibrate import Problem, Step, TooManyFailures, calibrate, has_converged, pose
+from ballfg.learning.calibration.calibrate import (
+    Problem,
+    Step,
+    TooManyFailures,
+    calibrate,
+    fitted_noise,
+    has_converged,
+    pose,
+)
 from ballfg.learning.calibration.coefficients import choose, values_of, with_values
 from ballfg.learning.calibration.report import compare, table
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -20,6 +28,7 @@ from ballfg.learning.evaluation import TrackScore, judge_track, summary
 from ballfg.learning.split import split_tracks
 from ballfg.progress import unwatched
 from ballfg.tracks import read_dataset, write_dataset
+from ballfg.tracks.noise import TrackNoise
 from tests.learning.conftest import PLANTED
 
 
@@ -122,6 +131,22 @@ def test_values_go_into_a_copy() -> None:
     changed = with_values(model, ["flight.drag.k"], np.array([0.2]))
     assert values_of(changed, ["flight.drag.k"]).tolist() == [0.2]
     assert values_of(model, ["flight.drag.k"]).tolist() == [0.12]
+
+
+def test_stated_noise_is_no_prior_of_the_noise_of_the_same_tracks(few_tracks: Path, tmp_path: Path) -> None:
+    """It counts as the noise of the estimates, and where these tracks say nothing: every spin has a label."""
+    dataset = read_dataset(few_tracks)
+    stated = TrackNoise(memory=(0.004,) * 3, memory_time=0.2, acceleration=0.5, spin_prior=7.0, contact_velocity=0.3)
+    write_dataset(tmp_path, replace(dataset.info, noise=stated), dataset, "csv")
+    plain, noted = posed(few_tracks), posed(tmp_path)
+    assert noted.settings.memory_time == 0.2
+    found, again = (fitted_noise(one, one.model, one.settings, errors=False) for one in (plain, noted))
+    assert found is not None
+    assert again is not None
+    assert again.noise == found.noise
+    assert found.noise.spin_prior is None
+    assert again.settings.spin_prior == 7.0
+    assert again.settings.memory_time == found.settings.memory_time == found.noise.memory_time
 
 
 def test_splits(few_tracks: Path, tmp_path: Path) -> None:
