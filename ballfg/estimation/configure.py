@@ -72,9 +72,9 @@ def _settings(dataset: Dataset | SightedDataset, model: BallModel, noises: Seque
     else:
         noise = _noise_of(dataset)
     if trained is None:
-        settings = Settings.for_measured(model, position_noise=noise)
+        settings = Settings.for_measured(model, position_noise=noise, spins=None)
     elif trained.elsewhere is not None and trained.is_foreign(info.name):
-        settings = Settings.for_measured(model, position_noise=noise, launcher=launcher_of(info, model))
+        settings = Settings.for_measured(model, position_noise=noise, launcher=launcher_of(info, model), spins=None)
         settings = with_noise(settings, trained.elsewhere)
     else:
         settings = Settings(
@@ -197,7 +197,7 @@ def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessN
 
 def with_usual_noise(settings: Settings, model: BallModel, share: float) -> Settings:
     """Settings whose noise, except for positions, moves to a model's usual one by a share from 0 to 1."""
-    usual = Settings.for_measured(model)
+    usual = Settings.for_measured(model, spins=None)
     spreads = {name: _between(s, usual.coefficients.get(name, s), share) for name, s in settings.coefficients.items()}
     own = settings.process
     noise = {name: _between(getattr(own, name), getattr(MEASURED, name), share) for name in PROCESS_NOISE}

@@ -150,7 +150,8 @@ class Settings:
             if self.spins is None:
                 raise ValueError(
                     f"group must be None for a model without groups; got {shown(self.group)}. Use a model file with "
-                    "the section populations, which ballfg-train writes with kind: calibrate and groups: LABEL."
+                    "the section populations, which ballfg-train writes with kind: calibrate and groups: LABEL; in "
+                    "Python write Settings.for_measured(model, group=...) with it."
                 )
             self.spins.check(self.group)
         if self.launcher is not None and not callable(getattr(self.launcher, "label", None)):
@@ -161,10 +162,16 @@ class Settings:
     def for_measured(cls, model: BallModel, **changes: Any) -> "Settings":
         """Settings for measured tracks: the model's coefficients are estimated with each track within their priors.
 
-        Args: model: gives the coefficients and their prior standard deviations.  changes: other fields.
+        Args: model: gives the coefficients and their prior standard deviations; of a model with groups of shots, also
+            their spins and the noise beside which they were found.  changes: other fields; spins=None: without groups.
         """
         usual: dict[str, Any] = {"coefficients": coefficient_sigmas(model), "process": MEASURED}
-        return cls(**(usual | changes))
+        if model.spins is None or changes.get("spins", model.spins) is None:
+            return cls(**(usual | changes))
+        from ballfg.estimation.noise.parameters import with_noise  # which needs this module
+
+        settings = cls(**usual, spins=model.spins)
+        return replace(settings if model.noise is None else with_noise(settings, model.noise), **changes)
 
     @property
     def has_memory(self) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import ballfg as bf
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.paths import paths
 from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
@@ -17,6 +18,7 @@ from ballfg.estimation.registry import make_estimator
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import Track
+from ballfg.tracks.noise import TrackNoise
 from ballfg.tracks.track import SPIN_LABELS
 
 MODEL, TABLE = nominal_model(), Surfaces.table_tennis(0.0)
@@ -137,5 +139,29 @@ def test_a_linearised_track_has_its_groups_prior() -> None:
 def test_a_group_without_populations_or_an_unknown_name_is_refused() -> None:
     with pytest.raises(ValueError, match=r"group must be None for a model without groups; got 'ann'.*groups: LABEL"):
         settings(spins=None, group="ann")
+    with pytest.raises(ValueError, match=r"in Python write Settings.for_measured\(model, group=...\) with it"):
+        Settings(group="ann")
     with pytest.raises(ValueError, match="group must be one of the model's, ann, bob; got 'eve'"):
         settings(group="eve")
+
+
+def test_python_takes_the_groups_of_a_model_as_the_commands_do() -> None:
+    """Without a dataset too: settings by hand, an estimator by itself, the front door."""
+    model, noise = nominal_model(), TrackNoise(position=(0.001,) * 3, memory_time=0.03, acceleration=0.02)
+    model.spins, model.noise = SPINS, noise
+    found = Settings.for_measured(model, group="ann", memory_time=0.05)
+    assert (found.spins, found.group, found.position_noise) == (SPINS, "ann", noise.position)
+    assert (found.process.acceleration, found.memory_time) == (0.02, 0.05)
+    assert Settings.for_measured(model, spins=None) == Settings.for_measured(MODEL)
+    track, known = shot("ann", 12, player="ann"), SPINS.groups["ann"]
+    estimates = [bf.estimate(track, model=model), Smoother(model, 0.0).estimate(track)]
+    estimates += [Online(model, 0.0, settings=found).estimate(shot("ann", 12))]
+    for estimate in estimates:
+        spin = launch_axes(START[3:]) @ estimate.states[0, SPIN]
+        np.testing.assert_allclose(spin, known.mean, atol=0.3 * min(known.sigma) + NEAR * 150.0)
+
+
+def test_the_noise_of_a_model_without_groups_is_not_that_of_its_settings() -> None:
+    model = nominal_model()
+    model.noise = TrackNoise(memory_time=0.03, acceleration=0.02)
+    assert Settings.for_measured(model) == Settings.for_measured(MODEL)
