@@ -271,6 +271,7 @@ def _opened(
     from ballfg.dynamics.nominal import TOLERANCE, inertia_factor, mismatch, nominal_note
     from ballfg.estimation.configure import table_note
     from ballfg.estimation.reading import unused_model
+    from ballfg.tracks import Dataset
 
     file, own = ball is not None and Path(ball).is_file(), data.ball
     named, usual = (own, None) if ball is None else _named(ball)
@@ -287,6 +288,8 @@ def _opened(
     doubts = _doubts_of(data, found, model)
     print_doubts(doubts)
     notes = [*data.notes, *filter(None, [table_note(data)])]
+    if found.spins is not None and isinstance(data, Dataset):
+        notes += found.spins.unknown(map(data.labels_of, data.names))
     if model is None and not file:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)

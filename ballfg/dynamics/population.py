@@ -4,7 +4,7 @@ Most of a short flight's prediction error comes from a spin that nobody measured
 spins have a mean and a spread of their own about each axis, which tell more than a wide prior about zero.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -13,6 +13,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.checks import check_number, listed, shown
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
+from ballfg.tracks.track import Label, label_text, level_of
 
 FASTEST: Final = 5000.0  # rad/s. Largest mean and spread; a larger one is in another unit
 _FIELDS: Final = ("by", "groups")
@@ -68,8 +69,8 @@ class SpinPopulation:
 
         Args: group: its name; an unknown one, or None, has the mean and the covariance of the mixture of all groups.
         """
-        known = self.groups.get(group) if group is not None else None
-        members = list(self.groups.values()) if known is None else [known]
+        known = None if group is None else level_of(group, self.groups)
+        members = list(self.groups.values()) if known is None else [self.groups[known]]
         share = np.array([member.tracks for member in members], dtype=np.float64)
         share /= share.sum()
         means, sigmas = (np.array([getattr(m, name) for m in members]) for name in ("mean", "sigma"))
@@ -79,11 +80,22 @@ class SpinPopulation:
 
     def check(self, group: str) -> None:
         """Refuses an unknown group. Raises: ValueError: if there is no such group."""
-        if group not in self.groups:
+        if level_of(group, self.groups) is None:
             raise ValueError(
                 f"group must be one of the model's, {listed(self.groups)}; got {shown(group)}. Leave it out for the "
                 "mixture of all groups."
             )
+
+    def unknown(self, labels: Iterable[Mapping[str, Label]]) -> tuple[str, ...]:
+        """A sentence on tracks whose groups are not known, from the labels of each; none without such a track."""
+        named = [own[self.by] for own in labels if self.by in own]
+        others = [label for label in named if level_of(label, self.groups) is None]
+        if not others:
+            return ()
+        return (
+            f"{len(others)} of {len(named)} tracks are of groups ({self.by}) that the model does not know, such as "
+            f"{shown(label_text(others[0]))}: they get the mixture of all its groups, {listed(self.groups)}",
+        )
 
     @classmethod
     def from_mapping(cls, content: Any) -> Self:

@@ -13,6 +13,7 @@ import numpy as np
 
 from ballfg.checks import check_number, listed, shown
 from ballfg.tracks import Track
+from ballfg.tracks.track import level_of
 
 TRACK: Final = "track"  # Takes the place of a label's name: tracks are told apart by their own names
 _FIELDS: Final = ("by", "values", "line")
@@ -65,7 +66,8 @@ class Variation:
         """The coefficient of a track; None for the model's own value."""
         if self.by != TRACK:
             label = track.labels.get(self.by)
-            return None if label is None else self.values.get(str(label))
+            level = None if label is None else level_of(label, self.values)
+            return None if level is None else self.values[level]
         if self.line:
             place = number_of(track.name)
             known = np.array(sorted((float(number_of(name) or 0), value) for name, value in self.values.items()))

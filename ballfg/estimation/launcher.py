@@ -13,7 +13,7 @@ from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.population import SpinPopulation, launch_axes
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.tracks import Track
-from ballfg.tracks.track import SPIN_LABELS
+from ballfg.tracks.track import SPIN_LABELS, label_text
 
 FIRST_SAMPLES = 10  # Number of samples whose mean direction of flight is the launch direction
 
@@ -104,7 +104,7 @@ class Launcher:
 
 def group_spin(spins: SpinPopulation, track: Track, group: str | None) -> SpinLabel:
     """The spin of a new shot of the group that the track's label names, else of `group`."""
-    mean, covariance = spins.spin(str(track.labels[spins.by]) if spins.by in track.labels else group)
+    mean, covariance = spins.spin(label_text(track.labels[spins.by]) if spins.by in track.labels else group)
     axes = launch_axes(launch_velocity(track))
     variances, vectors = np.linalg.eigh(covariance)
     return SpinLabel(mean @ axes, np.sqrt(variances), vectors.T @ axes, measured=False)

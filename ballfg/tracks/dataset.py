@@ -68,6 +68,10 @@ class Dataset(TrackFolder):
         """The names of the labels, in the order of `labels.csv`; empty without such a file."""
         return self._labels.names
 
+    def labels_of(self, name: str) -> dict[str, Label]:
+        """The labels of one track, without its positions; none for a track without a row in `labels.csv`."""
+        return self._labels.of(name)
+
     @property
     def has_sigmas(self) -> bool:
         """True if every sample has its own standard deviations."""

@@ -1,5 +1,6 @@
 """A track holds stamps, positions, other observations and labels of one shot."""
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self
@@ -27,6 +28,26 @@ SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 FASTEST_BALL = 200.0  # m/s. Largest speed of a ball; the record of all sports is a shuttlecock's, 157 m/s.
 FASTEST_SPIN = 2000.0  # rad/s. Largest spin of a ball; a golf ball off a wedge reaches 1,200.
 Label = float | str
+_WHOLE = re.compile(r"([+-]?[0-9]+)(\.0*)?")
+MOST_WHOLE = 1e15  # Beyond it not every whole number is a double
+
+
+def label_text(label: Label) -> str:
+    """A label as text; a whole number without a decimal point, as people write it."""
+    whole = not isinstance(label, str) and abs(label) < MOST_WHOLE and float(label).is_integer()
+    return str(int(label)) if whole else str(label)
+
+
+def level_of(label: Label, levels: Iterable[str]) -> str | None:
+    """The level that a label names: the same text, else the same whole number; None without one.
+
+    A column of numbers that holds one word is text: its "2.0" and the number 2 of another table are one level.
+    """
+    known, text = list(levels), label_text(label)
+    if text in known or (given := _WHOLE.fullmatch(text)) is None:
+        return text if text in known else None
+    same = (one for one in known if (level := _WHOLE.fullmatch(one)) and int(level[1]) == int(given[1]))
+    return next(same, None)
 
 
 class Measurements(Protocol):

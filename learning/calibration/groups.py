@@ -25,6 +25,7 @@ from ballfg.learning.calibration.population import Evidence, Population, evidenc
 from ballfg.learning.evaluation import Plain
 from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import Dataset
+from ballfg.tracks.track import label_text
 
 WIDEST: Final = 200.0
 """rad/s, standard deviation of the prior of a group's mean spin about zero; its spread begins there."""
@@ -76,7 +77,7 @@ class Groups:
             )
         own, wanted = dataset.info.name, set(fit)
         fitted = [track for track in dataset if track.name in wanted]
-        tracks = {track.name: str(track.labels.get(by, own)) for track in fitted}
+        tracks = {track.name: label_text(track.labels.get(by, own)) for track in fitted}
         labelled = frozenset(track.name for track in fitted if track.spin_label is not None)
         return cls(by, tuple(sorted(set(tracks.values()))), tracks, labelled, own)
 

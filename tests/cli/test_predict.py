@@ -242,6 +242,13 @@ def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytes
         a, b, mixture = (table(command, *options, *more) for more in (("--group", "a"), ("--group", "b"), ()))
         assert len({a, b, mixture}) == 3
 
+    write_dataset(tmp_path / "eve", dataset.info, (replace(track, labels={"player": "eve"}) for track in dataset))
+    options = ("--observe", 0.3, "--model", tmp_path / "model.yaml", "--out", tmp_path / "eve.csv")
+    capsys.readouterr()
+    assert status("predict", tmp_path / "eve", *options) == 0
+    said, count = capsys.readouterr().err, len(dataset)
+    assert f"{count} of {count} tracks are of groups (player) that the model does not know, such as 'eve'" in said
+
     def streamed(*options: object) -> str:
         capsys.readouterr()
         assert status("live", *options, "--model", tmp_path / "model.yaml", "--speed", 0) == 0

@@ -23,6 +23,16 @@ def test_a_known_group_has_its_own_mean_and_spread() -> None:
     np.testing.assert_allclose(covariance, np.diag(np.square(BACK.sigma)))
 
 
+def test_a_number_names_the_group_of_earlier_files_and_unknown_ones_are_counted() -> None:
+    numbered = SpinPopulation("session", {"1.0": BACK, "2": TOP})
+    for group, mean in (("1", BACK.mean), ("2.0", TOP.mean)):
+        numbered.check(group)
+        np.testing.assert_array_equal(numbered.spin(group)[0], mean)
+    assert numbered.unknown([{"session": 1.0}, {"session": "2.0"}, {}]) == ()
+    (note,) = numbered.unknown([{"session": 1.0}, {"session": 3.0}, {"session": "b"}, {}])
+    assert note.startswith("2 of 3 tracks are of groups (session) that the model does not know, such as '3': ")
+
+
 @pytest.mark.parametrize("unknown", [None, "side"])
 def test_an_unknown_group_has_the_moments_of_the_mixture(unknown: str | None) -> None:
     generator, count = np.random.default_rng(4), 400_000

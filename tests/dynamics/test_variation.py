@@ -22,6 +22,7 @@ def test_a_label_tells_the_value():
     assert variation.value(track(group="2")) == 0.88
     assert variation.value(track(group="other")) is None
     assert variation.value(track()) is None
+    assert variation.value(track(group=2.0)) == variation.value(track(group="2.0")) == 0.88
 
 
 def test_a_value_holds_from_one_track_to_the_next_one_named():

@@ -5,6 +5,7 @@ import pytest
 
 from ballfg.estimation import RadarSpeed
 from ballfg.tracks import Track
+from ballfg.tracks.track import label_text, level_of
 
 T = np.array([0.0, 0.1, 0.3])
 P = np.arange(9.0).reshape(3, 3)
@@ -25,6 +26,32 @@ def test_spin_label_needs_all_three():
     assert np.array_equal(Track(T, P, labels=SPIN, name="a").spin_label, [1, 2, 3])
     assert Track(T, P, labels={"spin_x": 1.0}, name="a").spin_label is None
     assert Track(T, P, name="a").spin_label is None
+
+
+@pytest.mark.parametrize(
+    ("label", "text"), [(1.0, "1"), (-2.0, "-2"), (1.5, "1.5"), (1e20, "1e+20"), ("1.0", "1.0"), ("top", "top")]
+)
+def test_a_whole_number_is_written_as_people_do(label, text):
+    assert label_text(label) == text
+
+
+@pytest.mark.parametrize(
+    ("label", "levels", "level"),
+    [
+        (1.0, ("1", "2"), "1"),
+        (1.0, ("1.0", "2.0"), "1.0"),  # of an earlier model file
+        ("2.00", ("1", "2"), "2"),
+        ("02", ("1", "2"), "2"),
+        ("1.0", ("1", "1.0"), "1.0"),
+        ("1.10", ("1.1", "1.10"), "1.10"),
+        ("1.100", ("1.1", "1.10"), None),
+        (1.5, ("1", "2"), None),
+        ("top", ("1", "top"), "top"),
+        ("3", ("1", "2"), None),
+    ],
+)
+def test_a_label_names_the_level_of_the_same_text_or_whole_number(label, levels, level):
+    assert level_of(label, levels) == level
 
 
 def test_until_keeps_the_first_sample_and_its_spin():

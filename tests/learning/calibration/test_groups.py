@@ -13,7 +13,9 @@ import torch
 
 from ballfg.dynamics import Surfaces, load_model, nominal_model
 from ballfg.dynamics.motion.paths import paths
+from ballfg.dynamics.population import launch_axes
 from ballfg.estimation import dataset_settings
+from ballfg.estimation.launcher import launch_velocity
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import CALIBRATED, GROUPED
 from ballfg.learning.calibration.calibrate import (
@@ -114,6 +116,31 @@ def test_other_tracks_are_predicted_better_with_intervals_that_hold(steps: list[
     assert found.tracks == plain.tracks == 20
     assert found.rmse_median < 0.6 * plain.rmse_median
     assert found.coverage_90 > 0.85
+
+
+def test_groups_of_numbers_are_whole_numbers_and_found_again(few: Path, tmp_path: Path) -> None:
+    """The column is one of numbers here, and of text in a table with another group: the spins are the same."""
+    data = read_dataset(few)
+    numbers = {"back": 1.0, "top": 2.0}
+    for name, other in (("sessions", {}), ("more", {"011": "practice"})):
+        tracks = [
+            replace(track, labels={"launcher": other.get(track.name, numbers[str(track.labels["launcher"])])})
+            for track in data
+        ]
+        write_dataset(tmp_path / name, data.info, tracks)
+    problem = posed(tmp_path / "sessions", max_iterations=1)
+    steps = list(calibrate(problem))
+    assert problem.groups is not None
+    assert problem.groups.names == ("1", "2")
+    found = population_settings(problem, steps[-1])
+    one, other = (read_dataset(tmp_path / name)["001"] for name in ("sessions", "more"))
+    assert (one.labels, other.labels) == ({"launcher": 2.0}, {"launcher": "2.0"})
+    spins = [found.spin_label(track) for track in (one, other)]
+    assert spins[0] is not None
+    assert spins[1] is not None
+    np.testing.assert_array_equal(spins[0].spin, spins[1].spin)
+    across = launch_axes(launch_velocity(one))[1]
+    assert spins[0].spin @ across == pytest.approx(steps[-1].spins[1].mean[1])
 
 
 def test_a_run_writes_the_groups_into_the_model(few: Path, tmp_path: Path) -> None:
