@@ -1,12 +1,14 @@
 """Reads the data of a training from a config: datasets, split, shots, and the settings of the estimator."""
 
+import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
 
+from ballfg.checks import shown
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.nominal import inertia_factor
@@ -59,6 +61,9 @@ def read_training_data(config: TrainConfig) -> TrainingData:
     radii = {dataset.info.ball.radius for dataset in datasets}
     if len(radii) > 1:
         raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
+    check_apart(datasets, tracks)
+    alike = [name for name, count in Counter(dataset.info.name for dataset in datasets).items() if count > 1]
+    print_notes(f"{shown(name)} names several datasets: they count as one room and group" for name in alike)
     analytic = analytic_model(config.model, datasets[0].info.ball)
     if not analytic.measures_plainly:
         raise ValueError("model must have no measurement effects; got some, which training does not know. Remove them.")
@@ -70,6 +75,23 @@ def read_training_data(config: TrainConfig) -> TrainingData:
     if not train:
         raise ValueError(f"data must hold a track to train on; none of {len(tracks)} can be used. See the notes above.")
     return TrainingData(shots, train, validation, analytic, embedding)
+
+
+def check_apart(datasets: Sequence[Dataset | SightedDataset], tracks: Iterable[tuple[int, Track]]) -> None:
+    """Refuses datasets that share a track, which would train and validate, whatever their names and folders.
+
+    Args: tracks: with the number of their dataset.
+    Raises: ValueError: naming the first such track.
+    """
+    first: dict[bytes, tuple[int, str]] = {}
+    for number, track in tracks:
+        content = hashlib.sha256(track.times.tobytes() + track.positions.tobytes()).digest()
+        owner, name = first.setdefault(content, (number, track.name))
+        if owner != number:
+            raise ValueError(
+                f"data must hold each track once; got track {shown(track.name)} of {datasets[number].path} also as "
+                f"{shown(name)} of {datasets[owner].path}. Give each recording once."
+            )
 
 
 def open_dataset(folder: str, anyway: bool | None = None) -> Dataset:

@@ -29,7 +29,7 @@ from ballfg.learning.calibration.run import read_checkpoint, status_of, take_ste
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, summary
 from ballfg.learning.run import run_folder as files
-from ballfg.learning.training_data import analytic_model, open_source
+from ballfg.learning.training_data import analytic_model, check_apart, open_source
 from ballfg.progress import Watch
 from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
@@ -133,6 +133,8 @@ def _check_alike(datasets: Sequence[Dataset | SightedDataset]) -> None:
         )
     if len(radii) > 1:
         raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Calibrate each kind apart.")
+    measured = [(number, one) for number, one in enumerate(datasets) if isinstance(one, Dataset)]
+    check_apart(datasets, ((number, track) for number, one in measured for track in one))
 
 
 def _own(config: CalibrationConfig, dataset: Dataset | SightedDataset) -> CalibrationConfig:

@@ -156,7 +156,9 @@ def test_what_does_not_go_together_is_refused(folders: tuple[Path, ...], tmp_pat
     info = read_dataset(first).info
     larger = replace(info, name="larger", ball=replace(info.ball, radius=0.03))
     write_dataset(tmp_path / "larger", larger, read_dataset(first))
+    write_dataset(tmp_path / "renamed", replace(info, name="renamed"), read_dataset(first))
     for data, message in (
+        ((first, str(tmp_path / "renamed")), r"each track once; got track '.*' of .*renamed also as"),
         ((first, first), "names that differ; got ball 0, ball 0"),
         ((first, str(tmp_path / "larger")), r"one kind of ball; got radii \[0.02, 0.03\]"),
     ):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradi
 from ballfg.learning.run.training import build
 from ballfg.learning.sequence.trainee import SequenceTrainee
 from ballfg.learning.training_data import FIRST_SPIN, FIRST_SPIN_NOISE, categories_of
-from ballfg.tracks import Track, read_dataset
+from ballfg.tracks import Track, read_dataset, write_dataset
 
 OBSERVE = {"samples": 25}
 SMALL = {"width_flight": 4, "width_contact": 4, "depth": 1, "pretrain": 2}
@@ -84,6 +86,18 @@ def test_a_residual_network_starts_as_what_it_corrects(few_tracks, capsys) -> No
 )
 def test_the_gradient_s_way(name, method, few_tracks) -> None:
     assert type(build(config(few_tracks, kind="a-tune", gradient=name))[0].method) is method
+
+
+@pytest.mark.parametrize("kind", ["a-tune", "lstm"])
+def test_a_track_is_in_one_dataset(kind, few_tracks, tmp_path) -> None:
+    """In two, whatever their names, it would train and validate."""
+    copied, renamed = tmp_path / "copy", tmp_path / "renamed"
+    shutil.copytree(few_tracks, copied)
+    write_dataset(renamed, replace(read_dataset(few_tracks).info, name="other"), reversed(list(read_dataset(copied))))
+    for other, track in ((few_tracks, "000"), (copied, "000"), (renamed, "005")):
+        message = rf"each track once; got track '{track}' of {other} also as '{track}' of {few_tracks}\. Give each"
+        with pytest.raises(ValueError, match=message):
+            build(config([few_tracks, other], kind=kind))
 
 
 def test_sequence_models_see_the_same_shots(few_tracks) -> None:
@@ -176,12 +190,14 @@ def test_without_launcher_nothing_is_said_of_spins(few_tracks) -> None:
     assert dict(trained.process_noise) == vars(trainee.shots[0].settings.process)
 
 
-def test_datasets_together(few_tracks, no_spin_labels) -> None:
+def test_datasets_together(few_tracks, no_spin_labels, capsys) -> None:
     """Each with its own settings; the split counts in each by itself."""
     trainee, train, validation = build(config([few_tracks, no_spin_labels], kind="a-tune", split={"by": "alternate"}))
     assert (list(train), list(validation)) == ([0, 2, 4, 6, 8], [1, 3, 5, 7])
     assert len({id(shot.settings) for shot in trainee.shots}) == 2
     assert trainee.judge([0, 7]).tracks == 2
+    note = "note: 'simulated table-tennis' names several datasets: they count as one room and group\n"
+    assert note in capsys.readouterr().err
 
 
 def test_balls_of_one_kind(few_tracks, tmp_path) -> None:
