@@ -11,8 +11,9 @@ import yaml
 from ballfg.checks import check_path, check_range, shown
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.domain import Domain
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.dynamics.effect import Effect, Kind
-from ballfg.dynamics.effects.registry import effect_class
+from ballfg.dynamics.effects.registry import EFFECTS, GENERIC, LEARNED, effect_class
 from ballfg.dynamics.model import BASE, THIN_SHELL, BallModel
 from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.variation import Variation
@@ -115,6 +116,7 @@ def model_from_dict(
         raise ValueError(f"{where}: {error}") from error
     model = AnalyticModel(effects, radius=radius, inertia_factor=inertia_factor)
     model.noise = noise
+    check_spreads(noise, model, f"{where}: measurement.")
     model.variations = _variations(content.get(VARIATIONS), model, where)
     model.spins = _spins(content.get(POPULATIONS), where)
     model.domain = _domain(content.get(DOMAIN), where)
@@ -170,6 +172,26 @@ def _without_noise(content: Mapping[str, Any], where: str) -> tuple[Mapping[str,
     except (ValueError, TypeError) as error:
         raise ValueError(f"{where}: measurement.{error}") from error
     return {**content, "measurement": {name: v for name, v in section.items() if name != NOISE}}, noise
+
+
+def check_spreads(noise: TrackNoise | None, model: BallModel, where: str) -> None:
+    """Refuses spreads between tracks of what is no coefficient; effects that the model lacks may have some.
+
+    Raises: ValueError: naming the nearest coefficient.
+    """
+    own = tuple(name for name, _ in model.named_parameters())
+    others = (name for name in (() if noise is None else noise.coefficients) if name not in own)
+    for name in others:
+        effects = {**EFFECTS, **GENERIC, **LEARNED}.values()
+        every = tuple(f"{effect.kind}.{effect.name}.{c.name}" for effect in effects for c in effect.coefficients)
+        from ballfg.dynamics.networks.fading import DOUBT, DOUBTS  # networks are imported where a file names one
+
+        plain = todays_name(name).removeprefix(BASE)  # a network's file names the coefficients of its base
+        if plain not in (*own, *every, *(DOUBT + c.name for c in DOUBTS)):
+            close = difflib.get_close_matches(plain, own, n=1) or difflib.get_close_matches(plain, every, n=1)
+            own_effect = "" if close else ". That of an effect of your own needs --effects-file FILE.py"
+            hint = f"{_nearest(plain, tuple(close) or own)}{own_effect}"
+            raise ValueError(f"{where}noise.coefficients: unknown coefficient {shown(name)}{hint}")
 
 
 def _effect(name: str, kind: Kind, values: Any, where: str) -> Effect:

@@ -7,9 +7,10 @@ from itertools import islice
 
 import numpy as np
 
+from ballfg.checks import shown
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.model_file import model_to_dict
+from ballfg.dynamics.model_file import check_spreads, model_to_dict
 from ballfg.dynamics.networks.fading import DOUBT
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
@@ -51,6 +52,7 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
     about them. Other noise that the model or, second, the dataset states takes precedence. The model's groups of shots
     give the spin of tracks without a spin label.
     """
+    check_spreads(dataset.info.noise, model, f"dataset.yaml of {shown(dataset.info.name)}: ")
     return _settings(dataset, model, (dataset.info.noise, _own_noise(dataset, model)))
 
 

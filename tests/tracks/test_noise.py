@@ -3,7 +3,9 @@
 import pytest
 
 from ballfg.dynamics import load_model, nominal_model, save_model
-from ballfg.tracks import TABLE_TENNIS
+from ballfg.estimation import dataset_settings
+from ballfg.tracks import TABLE_TENNIS, Track
+from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo, read_info, write_info
 from ballfg.tracks.noise import TrackNoise
 
@@ -36,6 +38,43 @@ def test_model_file_keeps_it(tmp_path):
     loaded = load_model(tmp_path / "model.yaml")
     assert loaded.noise == NOISE
     assert loaded.measures_plainly  # the noise is no effect
+
+
+def written(folder, coefficients):
+    """A model file with spreads of coefficients."""
+    model = nominal_model()
+    model.noise = TrackNoise(coefficients=coefficients)
+    save_model(model, folder / "model.yaml")
+    return folder / "model.yaml"
+
+
+NO_COEFFICIENT = [
+    ("flight.dragg.k", r"unknown coefficient 'flight.dragg.k'; did you mean 'flight.drag.k'\?$"),
+    ("flight.drag_by_sped.k", r"'flight.drag_by_sped.k'; did you mean 'flight\.drag\S*'\?$"),
+    ("spin", r"'spin'; known ones: flight.gravity.g, .*\. That of an effect of your own needs --effects-file FILE.py$"),
+]
+
+
+@pytest.mark.parametrize(("name", "message"), NO_COEFFICIENT)
+def test_a_spread_of_no_coefficient_is_refused(tmp_path, name, message):
+    with pytest.raises(ValueError, match=rf"model.yaml: measurement.noise.coefficients: .*{message}"):
+        load_model(written(tmp_path, {name: 0.05}))
+    info = DatasetInfo("shots", 0.0, TABLE_TENNIS, position_noise=0.001, noise=TrackNoise(coefficients={name: 0.05}))
+    data = dataset_in_memory(info, [Track([0.0, 0.1], [[0.0, 0.0, 1.0]] * 2)])
+    with pytest.raises(ValueError, match=rf"dataset.yaml of 'shots': noise.coefficients: .*{message}"):
+        dataset_settings(data, nominal_model())
+
+
+def test_spreads_of_other_models_may_stand_in_a_file(tmp_path):
+    """Of an effect that this model lacks, of a network's base and of its doubts, and under an earlier name."""
+    names = ("flight.wind.x", "base.flight.drag.k", "fading.flight", "contact.restitution.e")
+    spreads = dict.fromkeys(names, 0.01)
+    assert load_model(written(tmp_path, spreads)).noise.coefficients == {
+        name.removeprefix("base."): sigma for name, sigma in spreads.items()
+    }
+    info = DatasetInfo("shots", 0.0, TABLE_TENNIS, position_noise=0.001, noise=TrackNoise(coefficients=spreads))
+    data = dataset_in_memory(info, [Track([0.0, 0.1], [[0.0, 0.0, 1.0]] * 2)])
+    assert "flight.wind.x" not in dataset_settings(data, nominal_model()).coefficients
 
 
 LIMITS = {
