@@ -113,22 +113,27 @@ class HypothesisModel:
         gaps, gradients[:, : self.width] = self.motion.gaps(means[:, : self.width], level)
         return gaps, gradients
 
-    def may_touch(self, mean: Array, covariance: Array, dt: float) -> bool:
-        """True if a ball may come down to a surface within dt s; most are far: a coarse bound is first."""
+    def may_touch(self, mean: Array, covariance: Array, dt: float, *, told: bool = False) -> bool:
+        """True if a ball may come down to a surface within dt s; most are far: a coarse bound is first.
+
+        Args: told: True if the estimator says that it does, however far it is.
+        """
         way = mean[VZ] * dt - 0.5 * STEEPEST_FALL * dt**2
         reach = MOST_OFFSET + FAR * (np.sqrt(covariance[Z, Z]) + dt * np.sqrt(covariance[VZ, VZ]))
         lowest = mean[Z] - self.ball.radius + way - reach
-        if all(lowest > height for height in self.surfaces.heights()):
+        if not told and all(lowest > height for height in self.surfaces.heights()):
             return False
         level = self.level(mean)
-        if not np.isfinite(level) or np.trace(covariance[VELOCITY, VELOCITY]) > WIDE_VELOCITY**2 or lowest > level:
+        if not np.isfinite(level) or np.trace(covariance[VELOCITY, VELOCITY]) > WIDE_VELOCITY**2:
+            return False
+        if lowest > level and not told:
             return False
         (gap,), (gradient,) = self.gaps(mean[None], level)
         falling = min(float(mean[VZ]), 0.0)
         if gap < 0.0 or falling**2 + 2.0 * STANDARD_GRAVITY * gap < SLOWEST**2:
             return False
         gradient[VZ] += dt
-        return bool(gap + way < FAR * np.sqrt(gradient @ covariance @ gradient))
+        return told or bool(gap + way < FAR * np.sqrt(gradient @ covariance @ gradient))
 
     def predict_flight(self, balls: GaussianMixture, dt: float) -> GaussianMixture:
         """Balls after dt s of free flight, without surfaces."""

@@ -189,7 +189,7 @@ class ContactMonitor:
             bounced: True if, by the estimator, the ball has bounced within that number of last intervals.
         """
         if self._hypotheses is None:
-            if not self.model.may_touch(*before, dt):
+            if not self.model.may_touch(*before, dt, told=bounced(1)):
                 return None
             self._start(*before)
         return self._step(dt, measured, bounced)

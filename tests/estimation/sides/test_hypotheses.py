@@ -226,6 +226,18 @@ def test_a_ball_far_from_the_surface_is_left_to_its_estimator() -> None:
     assert monitor.step((high, np.diag(SIGMAS**2)), DT, SampleMeasurement(), lambda count: False) is None
 
 
+def test_a_bounce_that_is_still_to_come_has_not_happened() -> None:
+    """An estimator explains samples by a bounce after the newest stamp, and its state has bounced: the ball flies."""
+    monitor = ContactMonitor(hypothesis_model())
+    high = FALLING + np.array([0, 0, 0.05, 0, 0, 0, 0, 0, 0])
+    flown, _ = PreparedMotion(table_tennis().model, 9).fly(high[None], DT)
+    measured = SampleMeasurement(flown[0, :3], np.full(3, 1e-3))
+    told = monitor.step((high, np.diag(SIGMAS**2)), DT, measured, lambda count: True)
+    assert told is not None
+    assert not told.bounced
+    np.testing.assert_allclose(told.mean, flown[0], atol=1e-6)
+
+
 def test_a_sample_that_nothing_explains_is_not_believed_and_two_end_the_hypotheses() -> None:
     """A position 0.3 m off moves nothing; a second one means that something else has happened."""
     monitor, off = (
@@ -251,9 +263,9 @@ def test_a_side_is_told_as_long_as_the_estimator_takes_the_other() -> None:
         states.append(now[0].numpy().copy())
     for held in (False, True):
         monitor, told, covariance = ContactMonitor(hypothesis_model(model)), [], np.diag((0.1 * SIGMAS) ** 2)
-        for before, after in pairwise(states):
-            measured = SampleMeasurement(after[:3], np.full(3, 1e-4))
-            told.append(monitor.step((before, covariance), 0.01, measured, lambda count, held=held: held))
+        for step, (before, after) in enumerate(pairwise(states)):
+            measured, since = SampleMeasurement(after[:3], np.full(3, 1e-4)), step if held else np.inf
+            told.append(monitor.step((before, covariance), 0.01, measured, lambda count, since=since: count > since))
         assert told[0] is not None
         assert told[0].bounced
         assert (told[2] is None) == held
