@@ -186,7 +186,8 @@ def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequenc
     return found
 
 
-PATIENCE = 0.2  # s. A newcomer unseen for longer is forgotten.
+PATIENCE = 0.2  # s. A newcomer unseen for longer is forgotten,
+MISSED = 6  # or for so many usual steps of the stamps: the longer, the more often wrong positions lie on a path by chance
 SPEED = 12.0  # m/s per axis, spread of the velocity of a ball with one position
 BEND = 12.0  # m/s^2, deviation of a path from a line through two positions
 

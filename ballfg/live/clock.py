@@ -3,8 +3,10 @@
 import math
 from collections import deque
 from enum import Enum, auto
+from statistics import median
 
 RESTART_AFTER = 3  # Number of consecutive rising stamps far behind that mean a restart of the clock
+LAST_STEPS = 15  # Number of last steps between stamps whose median is the usual one
 
 
 class Stamp(Enum):
@@ -25,7 +27,7 @@ class Clock:
 
     Args: lag: s.  gap: s, longest time that a ball may stay unseen.
 
-    Attributes: newest: s.  safe: s, the newest stamp that is not in doubt.
+    Attributes: newest: s.  safe: s, the newest stamp that is not in doubt.  steps: s, the last ones between stamps.
     """
 
     def __init__(self, lag: float, gap: float) -> None:
@@ -33,7 +35,13 @@ class Clock:
         self.gap = gap
         self.newest = -math.inf
         self.safe = -math.inf
+        self.steps: deque[float] = deque(maxlen=LAST_STEPS)
         self._behind: deque[float] = deque(maxlen=RESTART_AFTER)
+
+    @property
+    def usual_step(self) -> float:
+        """s, median of the last steps from one stamp to the next; infinite before there are some."""
+        return median(self.steps) if len(self.steps) == LAST_STEPS else math.inf
 
     def tell(self, time: float) -> Stamp:
         """Classifies a stamp; a new one becomes the clock's time."""
@@ -56,6 +64,8 @@ class Clock:
         self._behind.clear()
         if time <= self.newest + max(self.lag, self.gap / 5) or self.newest == -math.inf:
             self.safe = max(self.safe, time)
+            if 0.0 < time - self.newest < math.inf:
+                self.steps.append(time - self.newest)
         self.newest = max(self.newest, time)
 
     def _far_behind(self, time: float) -> Stamp:

@@ -13,7 +13,7 @@ from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.settings import Settings
-from ballfg.live.ball import PATIENCE, Ball, BallEvent, Kept, Newcomer
+from ballfg.live.ball import MISSED, PATIENCE, Ball, BallEvent, Kept, Newcomer
 from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
 from ballfg.tracks import Ball as BallKind
@@ -260,8 +260,15 @@ class Tracker:
         now = self._clock.safe
         unseen = [ball for ball in self._balls if ball.last < now - self.gap]
         self._balls = [ball for ball in self._balls if ball not in unseen] if unseen else self._balls
-        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - PATIENCE]
+        forgotten = now - self._patience
+        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= forgotten]
         return [*gone, *map(self._lost, unseen)]
+
+    @property
+    def _patience(self) -> float:
+        """s, for which a newcomer may be unseen. Each ball may have stamps of its own."""
+        followed = 1 + len(self._balls) + len(self._newcomers)
+        return min(PATIENCE, MISSED * followed * self._clock.usual_step)
 
     def _undo_after(self, time: float) -> list[BallUpdate]:
         """Reverts the effect of a wrong stamp; a ball without other samples is lost."""
