@@ -186,8 +186,9 @@ def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequenc
     return found
 
 
-PATIENCE = 0.2  # s. A newcomer unseen for longer is forgotten,
-MISSED = 6  # or for so many usual steps of the stamps: the longer, the more often wrong positions lie on a path by chance
+PATIENCE, MISSED = 0.2, 6
+"""s, and usual steps of the stamps, after which an unseen newcomer is forgotten. The longer, the more often wrong
+positions lie on a path by chance."""
 SPEED = 12.0  # m/s per axis, spread of the velocity of a ball with one position
 BEND = 12.0  # m/s^2, deviation of a path from a line through two positions
 
