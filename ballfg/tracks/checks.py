@@ -4,7 +4,7 @@ Repairs: rows out of time order are sorted, exact repeats are dropped. Two diffe
 together count as one measurement with an inaccurate stamp: their mean replaces them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -69,6 +69,25 @@ def check_step(label: str, stamps: Array) -> None:
     if not MIN_STEP <= step <= MAX_STEP:
         problem = f"{label}: t must be in s, with a median step of {MIN_STEP:g} to {MAX_STEP:g} s; got {step:.4g} s"
         raise ValueError(f"{problem}. The unit is probably ms or us: convert it.")
+
+
+def check_overlap(spans: Mapping[str, tuple[float, float]], within: float = 0.0) -> None:
+    """Refuses a camera that recorded while no other did, nor within a time of it, s. Raises: ValueError: all times.
+
+    Args: spans: s, true time, the first and the last moment of each camera by its name.
+    """
+    or_soon = f", or follow one another within {within:g} s" if within else ""
+    for name, (start, end) in spans.items():
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(start <= last + within and first <= end + within for first, last in others):
+            rounded = {other: np.round(span, 3).tolist() for other, span in spans.items()}
+            when = "; ".join(
+                f"{shown(other)} {first:.13g} to {last:.13g} s" for other, (first, last) in rounded.items()
+            )
+            problem = f"videos must overlap in time{or_soon}; camera {shown(name)} overlaps with no other: {when}"
+            raise ValueError(
+                f"{problem} (true time). Check stamps and time_offset, or that the files are of one recording."
+            )
 
 
 def tidy(group: "RowGroup", where: Where, findings: Findings | None = None) -> Array:

@@ -22,6 +22,7 @@ STEPS: Final = 0.25  # Of the camera's period, between guessed times of a bounce
 WIDEST: Final = 1.0
 """m, largest standard deviation that is stated of a rough position: what is beyond is not known at all."""
 LEAST_STEP: Final = 4e-3  # s, least of these steps
+MOST_STEPS: Final = 2000  # Guessed times of a bounce; a track that is longer than 8 s may have longer steps
 ENOUGH: Final = 60  # Sightings that show the bounces: of more, some are left out
 PRICE: Final = 10.0  # Twice the log likelihood that a bounce must gain over a path without it
 BETTER: Final = 1.15  # Factor by which a further bounce must lower the misfit: spin bends flights too, but less
@@ -82,9 +83,10 @@ def bounced_at(rays: Rays, moments: Array, physics: SegmentationPhysics, surface
 
 def _bounced(scene: Scene, moments: Array) -> list[tuple[Paths, Array]]:
     """Paths with one bounce at all guessed times and misfits (k,); then those with more, while they fit better."""
-    step = max(STEPS * float(np.median(np.diff(moments))), LEAST_STEP) if len(moments) > 1 else 0.0
-    if not step > 0.0 or len(moments) < 2:
+    if len(moments) < 2:
         return []
+    span = float(moments[-1] - moments[0])
+    step = max(STEPS * float(np.median(np.diff(moments))), LEAST_STEP, span / MOST_STEPS)
     guesses = np.arange(moments[0] + step, moments[-1] - 0.5 * step, step)
     further = guesses[(guesses > moments[1]) & (guesses < moments[-2])]  # a flight of one sample explains anything
     found, least, poor = list[tuple[Paths, Array]](), np.inf, POOR * len(scene.rays.times)

@@ -1,4 +1,4 @@
-"""Looks up the cameras of sightings, checks their places, and puts sightings in order of their true times."""
+"""Looks up the cameras of sightings, checks their places and clocks, and puts sightings in order of true time."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -8,9 +8,12 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import listed, shown
+from ballfg.tracks.checks import check_overlap
 from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.track import Track
 from ballfg.vision.camera import Camera
 
+LONGEST_UNSEEN: Final = 3.0  # s. No flight that is seen at its ends only lasts longer: it would rise by 11 m
 APART: Final = 0.01  # m. Least distance of two cameras: rays from one point do not meet anywhere else, and count twice
 
 
@@ -34,6 +37,29 @@ def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera,
                 "Add it to cameras.yaml, or leave its sightings out."
             )
     return tuple(known[name] for name in sightings.cameras)
+
+
+def check_one_flight(track: Track) -> None:
+    """Refuses a ball that one camera saw, if it was out of sight for long. Raises: ValueError: naming the gap."""
+    gaps = np.diff(track.times)
+    if track.one_view and len(gaps) and gaps.max() > LONGEST_UNSEEN:
+        before = int(np.argmax(gaps))
+        start = round(float(track.times[before]), 3)
+        raise ValueError(
+            f"track {shown(track.name)}: a ball that one camera saw must not be out of sight for more than "
+            f"{LONGEST_UNSEEN:g} s; got {gaps[before]:.4g} s from t={start:.13g}. Give its flights names of their own, "
+            "or correct the stamps."
+        )
+
+
+def check_clocks(name: str, sightings: Sightings, cameras: Sequence[Camera]) -> None:
+    """Refuses sightings of one ball, in order of true time, by cameras far apart in time. Raises: ValueError."""
+    times = true_times_of(sightings, cameras)
+    own = {cameras[number].name: times[sightings.camera == number] for number in np.unique(sightings.camera)}
+    try:
+        check_overlap({camera: (float(t[0]), float(t[-1])) for camera, t in own.items()}, LONGEST_UNSEEN)
+    except ValueError as error:
+        raise ValueError(f"track {shown(name)}: {error}") from None
 
 
 def true_times_of(sightings: Sightings, cameras: Sequence[Camera]) -> Array:

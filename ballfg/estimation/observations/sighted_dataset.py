@@ -13,7 +13,7 @@ from ballfg.arrays import Array
 from ballfg.checks import listed, shown
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.rig import cameras_of, in_order, with_ends
+from ballfg.estimation.observations.rig import cameras_of, check_clocks, check_one_flight, in_order, with_ends
 from ballfg.estimation.observations.shadows import SHADOWS_FILE, with_shadows
 from ballfg.estimation.observations.sightings import TooFewSightingsError, sighted_track
 from ballfg.files.whole_folder import of_one_state
@@ -67,11 +67,13 @@ class SightedDataset(TrackFolder):
                     raise ValueError(f"{path / SHADOWS_FILE}, trajectory {shown(name)}: {error}") from None
             try:
                 seen = in_order(with_ends(sightings, cameras_of(sightings, rig)), rig)
+                check_clocks(name, seen, cameras_of(seen, rig))
                 track = sighted_track(name, seen, rig, own, model=model, surfaces=surfaces, bounces=known)
+                check_one_flight(track)
                 self._tracks[name] = replace(track, dataset=self)
             except TooFewSightingsError as error:
                 notes.append(str(error))
-            except ValueError as error:  # cameras at one point, or with numbers that no lens has
+            except ValueError as error:  # cameras at one point, with other clocks, with numbers that no lens has
                 raise ValueError(f"{path}: {error} Look at {CAMERAS_FILE}.") from None
         self.one_view = all(track.one_view for track in self)
 

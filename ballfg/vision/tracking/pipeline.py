@@ -11,6 +11,7 @@ from ballfg.arrays import Array, Index
 from ballfg.checks import did_you_mean, listed, shown
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
+from ballfg.tracks.checks import check_overlap
 from ballfg.vision.association.agreement import LEAST_MISFIT, Agreement, check_agreement
 from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.gathering import SeenBall
@@ -137,7 +138,8 @@ def track_detections(
     if wanted != given or len(set(wanted)) < len(wanted):
         raise ValueError(f"detections must be one for each camera; got {given} for {wanted}. Match their names.")
     ordered = tuple(by_name[camera.name] for camera in cameras)
-    check_overlap(ordered, cameras)
+    pairs = [(seen.frames - camera.time_offset, camera) for seen, camera in zip(ordered, cameras, strict=True)]
+    check_overlap({camera.name: (float(t[0]), float(t[-1])) for t, camera in pairs if len(t)})
     balls = tuple(associate(ordered, cameras, settings))
     return Tracking(tuple(cameras), ordered, balls, check_agreement(balls, cameras) if balls else None)
 
@@ -149,20 +151,6 @@ def check_rig(cameras: Sequence[Camera]) -> None:
             f"cameras must be at least {FEWEST}; got {len(cameras)}. For one camera run 'ballfg track', or "
             "track_one_camera of ballfg.estimation.one_camera."
         )
-
-
-def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -> None:
-    """Refuses a camera that recorded while no other did. Raises: ValueError: naming it and the times of all."""
-    spans: dict[str, tuple[float, float]] = {}
-    for seen, camera in zip(detections, cameras, strict=True):
-        if len(seen.frames):
-            spans[camera.name] = (seen.frames[0] - camera.time_offset, seen.frames[-1] - camera.time_offset)
-    for name, (start, end) in spans.items():
-        others = [span for other, span in spans.items() if other != name]
-        if others and not any(start <= last and first <= end for first, last in others):
-            when = "; ".join(f"{shown(other)} {first:g} to {last:g} s" for other, (first, last) in spans.items())
-            problem = f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time)"
-            raise ValueError(f"{problem}. Check stamps and time_offset, or that the files are of one recording.")
 
 
 def summary(tracking: Tracking) -> Iterator[str]:

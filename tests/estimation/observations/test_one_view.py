@@ -13,13 +13,14 @@ from scipy.stats import chi2
 import ballfg as bf
 from ballfg.dynamics import Surfaces
 from ballfg.dynamics.motion.rollout import rollout
-from ballfg.estimation.observations.one_view import STEPS, one_view
+from ballfg.estimation.observations.bounced_path import Scene
+from ballfg.estimation.observations.one_view import MOST_STEPS, STEPS, _bounced, one_view
 from ballfg.estimation.observations.ray_path import Rays
 from ballfg.estimation.observations.sighted_dataset import read_sighted
 from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.result import Status
-from ballfg.estimation.segmentation.physics import SegmentationPhysics
+from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.loss import Loss
@@ -90,6 +91,14 @@ def test_parabolas_are_recovered(bounces: bool, slope: tuple[float, float]) -> N
     np.testing.assert_allclose(found.path.velocities[0], velocity[0] - [0, 0, physics.gravity * since[0, 0]], atol=0.02)
     if bounces:
         assert found.bounces[0] == pytest.approx(at, abs=1e-9)
+
+
+def test_guesses_of_bounces_are_bounded_for_a_track_of_any_length(ball: World) -> None:
+    times, states = stroke(ball, 1)
+    late = np.where(np.arange(len(times)) < 12, times, times + 200.0)
+    rays = Rays.of(pixels_of(states[:, :3], late, SIDE, 1.0), late, [SIDE])
+    found = _bounced(Scene(rays, physics_of(ball.model), ball.surfaces, TABLE), late)
+    assert 0.9 * MOST_STEPS < len(found[0][0].times) <= MOST_STEPS
 
 
 def test_a_ball_that_meets_no_surface_is_refused() -> None:

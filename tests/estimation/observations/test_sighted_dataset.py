@@ -116,6 +116,30 @@ def test_sightings_outside_of_the_picture(folder: Path, size: tuple[int, int], c
         read_detections(folder / "detections.csv", read_cameras(folder / "cameras.yaml"))
 
 
+@pytest.mark.parametrize(("gap", "cameras"), [(5.0, (0, 0)), (1000.0, (0, 0)), (5.0, (0, 1, 0))])
+def test_a_ball_of_one_view_that_was_long_out_of_sight(folder: Path, gap: float, cameras: tuple[int, ...]) -> None:
+    """Two cameras that take turns are one view too; their spans overlap."""
+    seen = scene(0, world(), phases=(0.0, 0.0), duration=0.3).sightings
+    parts = [seen.select(np.flatnonzero(seen.camera == camera)) for camera in cameras]
+    late = [replace(part, times=part.times + (gap + 0.3) * k) for k, part in enumerate(parts)]
+    write_sightings(folder / "detections.csv", [("one", part) for part in late])
+    with pytest.raises(ValueError, match=r"must not be out of sight for more than 3 s; got (5|1000)\.?\d* s") as error:
+        read_sighted(folder)
+    assert str(error.value).startswith(f"{folder}: track 'one': ")
+
+
+@pytest.mark.parametrize("late", [-20.0, 5.0, 1000.0, 1.7e9])
+def test_cameras_whose_clocks_do_not_overlap(folder: Path, late: float) -> None:
+    seen = scene(0, world(), duration=0.3).sightings
+    times = seen.times + late * (seen.camera == 1)
+    write_sightings(folder / "detections.csv", [("one", replace(seen, times=times))])
+    said = "track 'one': videos must overlap in time, or follow one another within 3 s; camera 'right' overlaps with no"
+    with pytest.raises(ValueError, match=said):
+        read_sighted(folder)
+    write_cameras(folder / "cameras.yaml", [RIG[0], replace(RIG[1], time_offset=late), RIG[2]])
+    assert read_sighted(folder).names == ["one"]
+
+
 def test_source_can_be_chosen(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = folder / "states.csv"
     assert command("estimate", folder, "--from", "positions", "--out", out) == 2
