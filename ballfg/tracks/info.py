@@ -304,7 +304,9 @@ def _checked_extent(extent: Any) -> tuple[float, ...]:
 
 
 def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
-    if content.get(key) is None:
+    if key in content and content[key] is None:
+        raise ValueError(f"{prefix}{key} is required; nothing stands after {shown(f'{key}:')}. Write its value there.")
+    if key not in content:
         found = nearest(key, (str(name) for name in content if name not in _KNOWN))
         remedy = f"Add it, or rename {shown(found)}." if found else "Add it."
         raise ValueError(f"{prefix}{key} is required; got {listed(content)}. {remedy}")
