@@ -58,7 +58,7 @@ def read_sightings(
     """The sightings of each ball in the file.
 
     Rows without a trajectory are unassigned candidates; they are left out. Of several rows of one ball, camera and
-    stamp the one with the highest score counts. The order of rows is free.
+    stamp the one with the highest score counts. Exact repeats are dropped. The order of rows is free.
 
     Args:
         path: a table `trajectory,t,camera,u,v` (t in s, as recorded by the camera, u and v in px), optionally with
@@ -84,6 +84,11 @@ def read_sightings(
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (*REQUIRED, *OPTIONAL)]
     if nameless := len(texts[KEY]) - len(lines):
         notes.append(f"{path.name}: {nameless} rows without a trajectory left out")
+    once = without_repeats((np.unique(names, return_inverse=True)[1], seen_by), values)
+    if repeats := len(names) - len(once):
+        notes.append(f"{path.name}: {repeats} exact repeats of rows dropped")
+        lines, names, seen_by = lines[once], names[once], seen_by[once]
+        values = {column: cells[once] for column, cells in values.items()}
     rows, doubles = _chosen(path, lines, names, seen_by, values)
     if doubles:
         notes.append(f"{path.name}: {doubles} candidates with a lower score than another of the same ball left out")
@@ -101,6 +106,11 @@ def read_sightings(
         cues = (covariances(own), radii, streaks, shifts_of(own))
         found[name] = Sightings(tuple(time_offsets), seen_by[mine], own["t"], pixels, *cues)
     return found, notes
+
+
+def without_repeats(numbers: Sequence[Index], values: Mapping[str, Array]) -> Index:
+    """Indices of rows, each of them once; rows are equal by all numbers (n,), of texts, and columns (n,)."""
+    return np.sort(np.unique(np.column_stack((*numbers, *values.values())), axis=0, return_index=True)[1])
 
 
 def _chosen(path: Path, lines: Index, names: Texts, camera: Index, values: Mapping[str, Array]) -> tuple[Index, int]:
@@ -139,11 +149,11 @@ def read_columns(path: Path, required: Sequence[str]) -> tuple[list[str], dict[s
         table = pa_csv.read_csv(path, options, convert_options=csv_files.convert_options(texts, numbers))
     except pa.ArrowInvalid as error:
         raise csv_files.explain(path, numbers, str(error)) from None
-    return (
-        header,
-        {name: _texts(path, name, table.column(name)) for name in texts},
-        {name: np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in numbers},
-    )
+    values = {name: np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in numbers}
+    if set(RADIUS) <= values.keys():  # both are 0 where a program has no radius to write
+        radius, sigma = (values[name] for name in RADIUS)
+        values[RADIUS[1]] = np.where((radius == 0.0) & (sigma == 0.0), UNSTATED["sigma_u"], sigma)
+    return header, {name: _texts(path, name, table.column(name)) for name in texts}, values
 
 
 def _texts(path: Path, name: str, column: pa.ChunkedArray) -> Texts:

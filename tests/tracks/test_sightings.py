@@ -99,6 +99,31 @@ def test_radii_are_kept_and_unknown_ones_may_be_zero(tmp_path: Path) -> None:
         read_sightings(tmp_path / "detections.csv", OFFSETS)
 
 
+def test_an_unknown_radius_has_any_sigma(tmp_path: Path) -> None:
+    path = tmp_path / "detections.csv"
+    head = "trajectory,t,camera,u,v,radius,sigma_radius\na,0.1,left,1,2,5,0.3\n"
+    path.write_text(head + "a,0.2,left,1,2,0,0\na,0.3,left,1,2,0,0.7\n")
+    radii = read_sightings(path, OFFSETS)[0]["a"].radii
+    assert radii is not None
+    np.testing.assert_array_equal(radii[:, 0], [5.0, 0.0, 0.0])
+    assert radii[0, 1] == 0.3
+    path.write_text(head + "a,0.2,left,1,2,6,0\n")
+    with pytest.raises(ValueError, match=r"line 3, column 'sigma_radius': must be 0\.0001 to 1000000 px; got 0"):
+        read_sightings(path, OFFSETS)
+
+
+def test_exact_repeats_of_rows_are_dropped(tmp_path: Path) -> None:
+    """Another ball, camera, or place in the same frame is none."""
+    path, rows = tmp_path / "detections.csv", ["a,0.1,left,1,2", "b,0.1,left,1,2", "a,0.1,right,1,2", "a,0.2,left,1,2"]
+    path.write_text("\n".join(["trajectory,t,camera,u,v", *rows, *rows[1:]]) + "\n")
+    read, notes = read_sightings(path, OFFSETS)
+    assert notes == ["detections.csv: 3 exact repeats of rows dropped"]
+    assert [(name, len(ball)) for name, ball in read.items()] == [("a", 3), ("b", 1)]
+    path.write_text("\n".join(["trajectory,t,camera,u,v", *rows, rows[0], "a,0.1,left,1,3"]) + "\n")
+    with pytest.raises(ValueError, match="lines 2 and 7: one ball must be seen once"):
+        read_sightings(path, OFFSETS)
+
+
 def test_rows_are_put_in_order_of_true_time(tmp_path: Path) -> None:
     path = tmp_path / "detections.csv"
     path.write_text("trajectory,t,camera,u,v\na,0.104,right,1,2\na,0.102,left,3,4\na,0.103,right,5,6\n")

@@ -236,7 +236,7 @@ def read_detections(
     known = (*REQUIRED, *detections_file.OPTIONAL, *UNUSED)
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in known]
     number = np.unique(names, return_inverse=True)[1]
-    kept = np.sort(np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)[1])
+    kept = detections_file.without_repeats((number,), values)
     if len(kept) < len(names):
         notes.append(f"{path.name}: {len(names) - len(kept)} exact repeats of rows dropped")
     names, values = names[kept], {name: column[kept] for name, column in values.items()}
