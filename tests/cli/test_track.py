@@ -342,6 +342,8 @@ def test_bad_videos_are_refused(rig: Path, tmp_path: Path, capsys: pytest.Captur
     left, middle, right = (film(tmp_path / f"{model.name}.mp4") for model in RIG)
     out = tmp_path / "shots"
     words = ("--cameras", rig, "--out", out, "--jobs", 1)
+    alone = refused(capsys, left, "--out", out, "--time-offsets")
+    assert "--time-offsets must not be given without --cameras. Leave it out." in alone
     assert "got none for 'middle'. Give it as middle=FILE, or leave the camera out with --without middle" in refused(
         capsys, left, right, *words
     )
@@ -353,13 +355,11 @@ def test_bad_videos_are_refused(rig: Path, tmp_path: Path, capsys: pytest.Captur
     broken.write_bytes(right.read_bytes()[:2000])
     assert "broken.mp4 must be a file that FFmpeg decodes" in refused(capsys, left, middle, f"right={broken}", *words)
     small = film(tmp_path / "small.mp4", (160, 90))
-    assert "got 320x180 in the cameras' file and a video of 160x90" in refused(
-        capsys, left, middle, f"right={small}", *words
-    )
+    other = refused(capsys, left, middle, f"right={small}", *words)
+    assert "got 320x180 in the cameras' file and a video of 160x90" in other
     back = stamps(tmp_path / "back.csv", np.r_[np.arange(10), 8, np.arange(11, 20)] / 50.0)
-    assert "frame 10 has 0.16 s after 0.18 s" in refused(
-        capsys, left, middle, right, *words, "--stamps", f"left={back}"
-    )
+    behind = refused(capsys, left, middle, right, *words, "--stamps", f"left={back}")
+    assert "frame 10 has 0.16 s after 0.18 s" in behind
     later = stamps(tmp_path / "later.csv", 60.0 + np.arange(20) / 50.0)
     assert "camera 'right' overlaps with no other: 'left' 0 to 0.38 s; 'middle' 0 to 0.38 s; 'right' 60 to" in refused(
         capsys, left, middle, right, *words, "--stamps", f"right={later}"

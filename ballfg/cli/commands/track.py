@@ -97,7 +97,8 @@ def track(
 
     kind = ball_kind(ball)
     if cameras is None:
-        _refuse_moving(stamps=stamps, without=without, colour=colour, detector=detector, table_height=table_height)
+        given = {"stamps": stamps, "without": without, "colour": colour, "detector": detector}
+        _refuse_moving(**given, table_height=table_height, time_offsets=time_offsets)
         _moving_camera(recordings, out, kind, court, corners, candidates, name, jobs=jobs, force=force)
         return
     if (corners, candidates) != (None, None):
@@ -223,7 +224,8 @@ def _refuse_moving(**options: object) -> None:
     for name, value in options.items():
         if value:
             option = name.replace("_", "-")
-            raise ValueError(f"--{option} must not be given without --cameras; got {value}. Leave it out.")
+            got = "" if value is True else f"; got {value}"
+            raise ValueError(f"--{option} must not be given without --cameras{got}. Leave it out.")
 
 
 def _refuse(**options: object) -> None:
