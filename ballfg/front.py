@@ -351,7 +351,8 @@ def _model(model: Model, source: "Tracks | None") -> BallModel:
         check_instance("model", model, BallModel, "Load one with load_model, or give its file.")
         return model
     room = None if source is None else source.info.name
-    return load_model(Path(model), radius=ball.radius, inertia_factor=inertia_factor(ball), room=room)
+    radius = None if source is None else ball.radius  # a track by itself is of the ball that a network knows
+    return load_model(Path(model), radius=radius, inertia_factor=inertia_factor(ball), room=room)
 
 
 def _opened(measured: object) -> "Track | Tracks":

@@ -314,9 +314,12 @@ def _doubts_of(data: "Dataset | SightedDataset", model: "BallModel", file: Path 
     """What is not sure about a dataset, and how far it lies outside of what a model was fitted on."""
     from ballfg.estimation.flights.dataset import LOOKED_AT
 
+    doubts = data.info.doubts
+    if (own := model.learned_from) is not None:
+        doubts += (f"{file} learned from a ball with a radius of {own:g} m; this one has {model.radius:g} m",)
     if model.domain is None or data.rough:
-        return data.info.doubts
-    return (*data.info.doubts, *model.domain.doubts(islice(iter(data), LOOKED_AT), file))
+        return doubts
+    return (*doubts, *model.domain.doubts(islice(iter(data), LOOKED_AT), file))
 
 
 def model_alone(model: Path | None, ball: str | None) -> "tuple[BallModel, Settings]":
@@ -331,7 +334,7 @@ def model_alone(model: Path | None, ball: str | None) -> "tuple[BallModel, Setti
 
     loaded: BallModel = (known := _named(ball or "table_tennis")[1])
     if model is not None:
-        loaded = load_model(model, radius=known.radius, inertia_factor=known.inertia_factor)
+        loaded = load_model(model, radius=None if ball is None else known.radius, inertia_factor=known.inertia_factor)
     settings = Settings.for_measured(loaded)
     if loaded.trained is not None:
         settings = Settings(position_scale=loaded.trained.position_scale, process=learned_process(loaded.trained))

@@ -54,6 +54,7 @@ class BallModel(nn.Module, ABC):
         variations: coefficients that differ between tracks, by name as in `named_parameters()`.
         spins: the spins of groups of shots; None if unknown.
         domain: the speeds, spins and places of the tracks that it was fitted on; None if unknown.
+        learned_from: m, radius of the ball whose tracks taught its networks, if that is another ball; else None.
         random: True if the model draws random numbers, so that the same state has another future each time; machine
             code then uses its `in_flight`.
 
@@ -78,6 +79,7 @@ class BallModel(nn.Module, ABC):
         self.variations: Mapping[str, Variation] = {}
         self.spins: SpinPopulation | None = None
         self.domain: Domain | None = None
+        self.learned_from: float | None = None
 
     def for_track(self, track: "Track") -> Self:
         """The model with the coefficients of one track; the model itself if none differ between tracks."""

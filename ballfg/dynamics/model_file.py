@@ -28,6 +28,7 @@ POPULATIONS: Final = "populations"
 SPIN: Final = "spin"  # Entry of the section `populations`
 DOMAIN: Final = "domain"
 SECTIONS = (*KINDS, VARIATIONS, POPULATIONS, DOMAIN, "learned")
+RADIUS: Final = 0.02  # m, of a ball that nobody states: a table-tennis ball's
 LONGEST_NAME: Final = 255  # Characters of a folder's name
 NOISE: Final = "noise"
 """Entry of the section `measurement` that is not an effect: the scatter of tracks about the model."""
@@ -35,14 +36,14 @@ NOISE: Final = "noise"
 
 @of_one_state
 def load_model(
-    path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, room: str | None = None
+    path: str | Path, *, radius: float | None = None, inertia_factor: float = THIN_SHELL, room: str | None = None
 ) -> BallModel:
     """Read a model file.
 
     Args:
         path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `populations`, `domain`,
             `learned` (docs/models.md).
-        radius: m, of the ball, usually from the dataset.
+        radius: m, of the ball, usually from the dataset; None: that which networks learned from, else 0.02.
         inertia_factor: moment of inertia divided by m R^2.
         room: name of the dataset to estimate. In a room outside of its training a network that fades keeps half of its
             correction, or nothing if that did not help held-out training tracks. None: as trained.
@@ -51,7 +52,7 @@ def load_model(
     Raises:
         FileNotFoundError: if the model file or the learned folder does not exist.
         ValueError: if it is not YAML, or names a section, effect or coefficient that does not exist, or a value
-            outside its bounds; or if the folder does not hold a learned part of this version.
+            outside its bounds; or if the folder does not hold a learned part of this version, or one of another ball.
     """
     path = check_path("path", path)
     if path.is_dir():
@@ -61,19 +62,20 @@ def load_model(
     content = read_yaml(path)
     learned = content.get("learned") if isinstance(content, Mapping) else None
     if learned is None:
-        return model_from_dict(content, radius=radius, inertia_factor=inertia_factor, where=str(path))
+        size = RADIUS if radius is None else radius
+        return model_from_dict(content, radius=size, inertia_factor=inertia_factor, where=str(path))
     beside = isinstance(learned, str) and learned not in (".", "..") and Path(learned).name == learned
     if not beside or not 0 < len(learned) <= LONGEST_NAME:
         raise ValueError(
             f"{path}: section 'learned' must be null or the name of a folder beside the file; got {shown(learned)}. "
             "Copy the folder there."
         )
-    analytic = model_from_dict(
-        {**content, "learned": None}, radius=radius, inertia_factor=inertia_factor, where=str(path)
-    )
     from ballfg.dynamics.networks.learned import LearnedModel  # networks are imported where a file names one
-    from ballfg.dynamics.networks.learned_file import read_learned
+    from ballfg.dynamics.networks.learned_file import read_learned, trained_radius
 
+    content = {**content, "learned": None}
+    size = (trained_radius(path.parent / learned) or RADIUS) if radius is None else radius
+    analytic = model_from_dict(content, radius=size, inertia_factor=inertia_factor, where=str(path))
     model = read_learned(path.parent / learned, analytic)
     abroad = room is not None and model.trained is not None and model.trained.is_foreign(room)
     if abroad and isinstance(model, LearnedModel) and model.fading is not None:
@@ -82,7 +84,7 @@ def load_model(
 
 
 def model_from_dict(
-    content: Any, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, where: str = "model"
+    content: Any, *, radius: float = RADIUS, inertia_factor: float = THIN_SHELL, where: str = "model"
 ) -> AnalyticModel:
     """The model of a parsed model file without a learned part.
 

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from ballfg.dynamics import nominal_model, save_model
+from ballfg.dynamics import Architecture, build, nominal_model, save_model
 from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.estimation import ConformalScales
 from ballfg.estimation.conformal import load_conformal
@@ -222,6 +222,21 @@ def test_bad_calibration_tracks(
     assert lines[0].startswith("ballfg: error: ")
     assert message in lines[0]
     assert list(out.iterdir()) == []
+
+
+def test_networks_that_learned_from_another_ball_are_a_doubt(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that correct laws; without laws they are refused."""
+    options = ("--observe", 0.3, "--model", tmp_path / "m.yaml", "--out", tmp_path / "p.csv")
+    base = nominal_model("tennis")
+    for residual, code in ((True, 0), (False, 2)):
+        small = Architecture.of("mnn+gs", width_flight=2, width_contact=2, depth=1, residual=residual)
+        save_model(build(small, radius=base.radius, base=base if residual else None), tmp_path / "m.yaml")
+        assert status("predict", dataset.path, *options) == code
+    said = "".join(capsys.readouterr())
+    assert "m.yaml learned from a ball with a radius of 0.0335 m; this one has 0.02 m" in said
+    assert "the ball must have the radius 0.0335 m that its networks learned from; got 0.02 m" in said
 
 
 def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

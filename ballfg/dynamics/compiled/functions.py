@@ -95,7 +95,17 @@ _weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictio
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """Attributes of every module; its parameters, buffers and parts are compared by themselves."""
 _BESIDE: Final = frozenset(
-    {"trained", "noise", "variations", "measurement", "spins", "domain", "coefficients", "parameter_count"}
+    {
+        "trained",
+        "noise",
+        "variations",
+        "measurement",
+        "spins",
+        "domain",
+        "learned_from",
+        "coefficients",
+        "parameter_count",
+    }
 )
 """Attributes of a ball model and of its effects that do not belong to its motion: priors among them."""
 

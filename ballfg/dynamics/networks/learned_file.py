@@ -23,6 +23,7 @@ from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import Fading
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.nominal import TOLERANCE
 from ballfg.dynamics.trained import Trained
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
@@ -66,6 +67,8 @@ class _Config(_Section):
     architecture: Architecture | None
     trained: _TrainedConfig | None
     fading: _FadingConfig | None = None
+    radius: Annotated[float, Field(gt=0.0)] | None = None
+    """m, of the ball that the networks learned from; None in files of earlier versions."""
 
 
 def has_learned_part(model: BallModel) -> bool:
@@ -79,7 +82,9 @@ def write_learned(model: BallModel, parent: Path, stem: str) -> str:
     Args: model: learned, or analytic with `trained`.  parent: folder to write into.  stem: start of the name.
     Returns: the folder's name. It appears only once it is complete, and nothing removes it: users copy model files.
     """
-    config = yaml.safe_dump(_config(model).model_dump(mode="json"), sort_keys=False, allow_unicode=True).encode()
+    content = _config(model)
+    stated = content.model_dump(mode="json", exclude={"radius"} if content.radius is None else None)
+    config = yaml.safe_dump(stated, sort_keys=False, allow_unicode=True).encode()
     weights = safetensors.torch.save({name: t.detach().contiguous() for name, t in _tensors(model).items()})
     folder = parent / f"{stem}{LEARNED}{_digest(config, weights)}"
     with whole_folder(folder) as part:
@@ -111,6 +116,14 @@ def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
     return model
 
 
+def trained_radius(folder: Path) -> float | None:
+    """The radius, m, of the ball that the networks of a folder learned from; None if it does not say.
+
+    Raises: ValueError: if its config is damaged.
+    """
+    return _read_config(folder / CONFIG).radius if (folder / CONFIG).is_file() else None
+
+
 def _digest(config: bytes, weights: bytes) -> str:
     return hashlib.sha256(config + weights).hexdigest()[:12]
 
@@ -139,7 +152,8 @@ def _config(model: BallModel) -> _Config:
             rooms=trained.rooms,
             elsewhere=None if trained.elsewhere is None else trained.elsewhere.to_mapping(),
         )
-    return _Config(architecture=architecture, fading=_fading(model), trained=noted)
+    radius = None if architecture is None else model.learned_from or model.radius
+    return _Config(architecture=architecture, fading=_fading(model), trained=noted, radius=radius)
 
 
 def _fading(model: BallModel) -> _FadingConfig | None:
@@ -179,8 +193,10 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
                 f"{folder / CONFIG}: a model that is not residual must stand alone; the model file declares "
                 f"{', '.join((*analytic.flight, *analytic.bounce))}. Leave its sections flight and bounce empty."
             )
+        learned_from = _of_another_ball(config, analytic.radius, folder)
         base = analytic if architecture.residual else None
         model = build(architecture, radius=analytic.radius, inertia_factor=analytic.inertia_factor, base=base)
+        model.learned_from = learned_from
         if config.fading is not None:
             if base is None:
                 raise ValueError(f"{folder / CONFIG}: fading must have a model to fade to; make architecture residual.")
@@ -194,6 +210,22 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
     if config.trained is not None:
         model.trained = _trained(config.trained, folder)
     return model
+
+
+def _of_another_ball(config: _Config, given: float, folder: Path) -> float | None:
+    """The radius of the ball that networks learned from, if it is not that of the given one; else None.
+
+    Raises: ValueError: if they stand alone, without a law of another model that holds for this ball.
+    """
+    own, architecture = config.radius, config.architecture
+    if own is None or abs(given / own - 1.0) <= TOLERANCE:
+        return None
+    if architecture is None or not architecture.residual:
+        raise ValueError(
+            f"{folder / CONFIG}: the ball must have the radius {own:g} m that its networks learned from; got {given:g} "
+            "m, and networks know no other ball. Train on tracks of this one, or correct ball.radius in dataset.yaml."
+        )
+    return own
 
 
 def _trained(config: _TrainedConfig, folder: Path) -> Trained:

@@ -13,7 +13,7 @@ import torch
 import yaml
 
 from ballfg.dynamics import AnalyticModel, Architecture, BallModel, build, load_model, nominal_model, save_model
-from ballfg.dynamics.model_file import model_to_dict
+from ballfg.dynamics.model_file import model_from_dict, model_to_dict
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.population import SpinGroup, SpinPopulation
@@ -82,6 +82,46 @@ def test_noise_and_spins_of_the_corrected_model_are_read_and_written_again(tmp_p
     save_model(first, tmp_path / "n.yaml")
     again = load_model(tmp_path / "n.yaml", radius=0.02)
     assert (again.noise, again.spins) == (first.noise, first.spins)
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_networks_know_the_ball_that_they_learned_from(residual, every_effect, tmp_path):
+    """Its radius is that of a model whose caller states none; another ball is refused, a like one is not."""
+    architecture = Architecture.of("mnn+gs", width_flight=5, width_contact=4, residual=residual)
+    base = model_from_dict(model_to_dict(every_effect), radius=0.033) if residual else None
+    save_model(build(architecture, radius=0.033, base=base), tmp_path / "m.yaml")
+    assert load_model(tmp_path / "m.yaml").radius == 0.033
+    like = load_model(tmp_path / "m.yaml", radius=0.035)
+    assert (like.radius, like.learned_from) == (0.035, None)
+    for other in (0.02, 0.11):
+        if residual:  # which keeps the law that it corrects
+            model = load_model(tmp_path / "m.yaml", radius=other)
+            assert (model.radius, model.learned_from) == (other, 0.033)
+            save_model(model, tmp_path / "again.yaml")
+            assert load_model(tmp_path / "again.yaml").radius == 0.033
+            continue
+        message = rf"config.yaml: the ball must have the radius 0.033 m that its networks .*; got {other} m, .*Train on"
+        with pytest.raises(ValueError, match=message):
+            load_model(tmp_path / "m.yaml", radius=other)
+    with pytest.raises(ValueError, match=r"radius must be 0.001 to 1 m; got 0\."):
+        load_model(tmp_path / "m.yaml", radius=0.0)
+
+
+def test_a_file_of_earlier_versions_takes_any_ball(saved, tmp_path):
+    path, folder = saved
+    content = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    assert content.pop("radius") == 0.02
+    (folder / "config.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    folder.rename(folder.with_name("earlier"))  # a name without a digest
+    path.write_text(path.read_text().replace(folder.name, "earlier"))
+    assert load_model(path, radius=0.11).radius == 0.11
+    assert load_model(path).radius == 0.02
+    nominal = nominal_model()
+    nominal.trained = Trained({}, 1.0, None, None)
+    save_model(nominal, tmp_path / "tuned.yaml")
+    (tuned,) = tmp_path.glob("tuned.learned-*/config.yaml")
+    assert "radius" not in tuned.read_text()  # laws hold for every size
+    assert load_model(tmp_path / "tuned.yaml", radius=0.11).radius == 0.11
 
 
 def test_values_of_groups_stay_those_of_the_model_it_corrects(every_effect, tmp_path):
