@@ -7,7 +7,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ballfg.checks import shown
 from ballfg.dynamics.earlier_names import todays_names
-from ballfg.learning.config.training import Count, Names, Positive, Section, Share
+from ballfg.learning.config.training import Count, Jobs, Names, Positive, Section, Share
 
 Coefficients = Annotated[
     tuple[str, ...],
@@ -90,7 +90,7 @@ class CalibrationConfig(Section):
     failure_limit: Share = 0.2
     """Share of the fitted tracks whose estimates may fail and are skipped. More stop the run."""
 
-    jobs: Count | None = None
+    jobs: Jobs | None = None
     """Processes; null: one per core. The result does not depend on it."""
 
     @model_validator(mode="after")

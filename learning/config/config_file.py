@@ -1,6 +1,7 @@
 """Reads the config file of `ballfg-train`, YAML with `key=value` overrides, and checks it."""
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -108,7 +109,10 @@ def _explained(error: ValidationError, config: type[Config]) -> str:
     if first["type"] == "too_short":
         return f"'{key}' must hold at least one; got {shown(got)}. Leave it out or fill it."
     rule = first["msg"].removeprefix("Input ").removeprefix("should ").replace("a valid tuple", "a list")
-    hint = " YAML reads 1e-3 as text; write 1.0e-3." if _is_number(got) else " docs/train.md lists the keys."
+    number = _number(got)
+    if number is not None and not math.isfinite(number):
+        rule, number = "be a finite number", None
+    hint = " YAML reads 1e-3 as text; write 1.0e-3." if number is not None else " docs/train.md lists the keys."
     return f"'{key}' must {rule}; got {shown(got)}.{hint}"
 
 
@@ -142,9 +146,9 @@ def _fields_of(section: Any) -> list[str]:
     return list(section.model_fields) if isinstance(section, type) and issubclass(section, BaseModel) else []
 
 
-def _is_number(value: Any) -> bool:
+def _number(value: Any) -> float | None:
+    """The number that a text holds; None for another text or value."""
     try:
-        float(value)
-    except (TypeError, ValueError):
-        return False
-    return isinstance(value, str)
+        return float(value) if isinstance(value, str) else None
+    except ValueError:
+        return None

@@ -7,12 +7,16 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from ballfg.checks import shown
 from ballfg.dynamics.earlier_names import warn_of
+from ballfg.dynamics.networks.architecture import MOST_DEPTH, MOST_WIDTH
 from ballfg.learning.trainee import TRAINEES
+from ballfg.machine import MOST_JOBS
 
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1)]
+Width = Annotated[int, Field(ge=1, le=MOST_WIDTH)]
+Jobs = Annotated[int, Field(ge=1, le=MOST_JOBS)]
 Names = Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
 
 
@@ -46,13 +50,13 @@ class Section(BaseModel):
 class ArchitectureConfig(Section):
     """Size and form of a network for the dynamics. null: the default of the kind."""
 
-    width_flight: Count | None = None
+    width_flight: Width | None = None
     """Width of the hidden states in the flight network."""
 
-    width_contact: Count | None = None
+    width_contact: Width | None = None
     """Width of the hidden states in the contact network."""
 
-    depth: Count | None = None
+    depth: Annotated[int, Field(ge=1, le=MOST_DEPTH)] | None = None
     """Number of times that the hidden layer is applied."""
 
     residual: bool | None = None
@@ -281,7 +285,7 @@ class TrainConfig(Section):
     diverged_limit: Count = 10
     """Steps in a row that may be skipped because loss or gradient is not finite. One more stops the run."""
 
-    jobs: Count | None = None
+    jobs: Jobs | None = None
     """Processes on this machine; null: one per core. The count of torchrun replaces it. The results depend on it by
     rounding only."""
 
