@@ -22,14 +22,24 @@ def unit(jacobian):
             jacobian[i, j] = 1.0 if i == j else 0.0
 
 
+def finite(state, matrix):
+    """True if all are finite."""
+    total = 0.0
+    for i in range(9):
+        total += 0.0 * state[i]
+        for j in range(9):
+            total += 0.0 * matrix[i, j]
+    return total == 0.0
+
+
 def fly(laws, state, dt, after, jacobian):
-    """Free flight. Without surfaces; dt may be negative. Returns 1, or 0 if |dt| is no number of at most 20 s."""
+    """Free flight. Without surfaces; dt may be negative. Returns 1; 0: |dt| > 20 s, or a number is not finite."""
     if not abs(dt) <= LONGEST_MOTION:
         return False
     put(after, state)
     unit(jacobian)
     fly_one(laws.rates, after, jacobian, dt, np.zeros(9), steps_over(abs(dt)))
-    return True
+    return finite(after, jacobian)
 
 
 def contact(laws, radius, state, height, longest, tau, after, jacobian):
@@ -47,7 +57,7 @@ def contact(laws, radius, state, height, longest, tau, after, jacobian):
         time, no_change, after.reshape((1, 9)), jacobian.reshape((1, 9, 9)),
     )  # fmt: skip
     tau[0] = time[0]
-    return not math.isnan(time[0])
+    return math.isfinite(time[0]) and finite(after, jacobian)
 
 
 def predict(laws, rolling, world, noise, state, covariance, count, times, states, covariances):
@@ -82,6 +92,8 @@ def predict(laws, rolling, world, noise, state, covariance, count, times, states
             surface.c, surface.ct, rates.w, impact.w, surface.w, world, noise, states[k].reshape((1, 1, 9)),
             covariances[k].reshape((1, 1, 9, 9)), beside[1:], besides[1:], level[1:], age[1:],
         )  # fmt: skip
+        if not finite(states[k], covariances[k]):
+            return k
     return count
 
 
@@ -111,6 +123,8 @@ def cross_plane(
     time[0], time_sigma[0] = elapsed, np.inf
     if end != FOUND:
         return 0 if end == NONE else -1
+    if not finite(there, spread):
+        return -1
     closing = 0.0
     for i in range(9):
         closing += line[i] * rate[i]

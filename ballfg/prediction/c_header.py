@@ -25,6 +25,7 @@ from ballfg.prediction import c_functions
 from ballfg.state import STATE_DIM
 
 WORLD, NOISE = 11, 5
+ON_LINE: Final = 64  # Numbers of a table on a line, of 1,400 characters; C99 promises 4,095
 WEIGHTS: Final = "weights"
 ARGUMENTS: Final[dict[str, tuple[int | None, ...] | str]] = {
     **dict.fromkeys(("state", "after", "there"), (STATE_DIM,)),
@@ -49,19 +50,19 @@ TEXT: Final = """\
    products of those units. All functions may be called from several threads.
 
    int {p}_fly(state, dt, after, jacobian)
-     Free flight over dt s, up to 20 s either way. Returns 1, or 0 where dt is no such number.
+     Free flight over dt s, up to 20 s either way. Returns 1; 0: dt is no such number, or a result is not finite.
    int {p}_contact(state, height, longest, tau, after, jacobian)
      The next contact with a surface at a height (m), the last one for a ball below it, at most `longest` s away:
      its time tau (s) and the state after it. The Jacobian holds the change of that time. Returns 1; 0: there is none.
    int {p}_predict(world, noise, state, covariance, count, times, states, covariances)
      States and covariances at `count` times (s from now, not decreasing), without measurement noise. Near a contact
      they hold the balls that have bounced and those that have not. Returns how many are written: fewer where the ball
-     lands or bounces several times within 20 ms, or where a time decreases.
+     lands or bounces several times within 20 ms, a time decreases, or a result is not finite.
    int {p}_cross_plane(world, noise, state, covariance, normal, offset, direction, horizon,
                        time, time_sigma, there, spread)
      The next crossing of normal . p = offset (m) by the centre within `horizon` s: its time and the standard deviation
      of it (s), the state there and its covariance on the plane. direction: 1 along the normal, -1 against it, 0 either.
-     Returns 1; 0: it does not cross; -1: an argument is not finite, or the ball lands or bounces several times before.
+     Returns 1; 0: it does not cross; -1: a number is not finite, or the ball lands or bounces several times before.
 
    world[{world_size}]: m, height of the table and of the floor (-INFINITY: none), radius of the ball; the table's ends
      x_low, x_high, y_low, y_high (infinite: unknown) and their standard deviations.
@@ -167,7 +168,8 @@ def _routine(name: str, function: Function, routines: dict[str, Routine]) -> Rou
 
 def _in_lines(values: Sequence[float]) -> str:
     texts = [text.replace("0.", ".", 1) if text.lstrip("-").startswith("0.") else text for text in _written(values)]
-    return ",\n".join(",".join(texts[i : i + 6]) for i in range(0, len(texts), 6))
+    texts = [text.replace("e-0", "e-") for text in texts]
+    return ",\n".join(",".join(texts[i : i + ON_LINE]) for i in range(0, len(texts), ON_LINE))
 
 
 def _written(values: Sequence[float]) -> list[str]:

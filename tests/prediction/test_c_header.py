@@ -207,6 +207,33 @@ def test_what_cannot_be_answered_is_said(in_c: InC) -> None:
     assert in_c("contacts", 1, state[None].copy(), 0.0, float("nan"), np.empty(1), *outs) == 0
 
 
+@pytest.mark.parametrize("motion", [(np.nan, 0, 0), (np.inf, 0, 0), (4, 1, np.nan)], ids=["nan", "inf", "spin"])
+def test_results_that_are_no_numbers_are_no_success(in_c: InC, motion: tuple[float, float, float]) -> None:
+    (_, covariance), *_ = shots(1)
+    state = np.array([[-1.0, 0.1, 0.3, motion[0], motion[1], 1.0, 0.0, motion[2], 0.0]])
+    outs = np.empty((1, 9)), np.empty((1, 9, 9))
+    assert in_c("flights", 1, state, np.array([0.1]), *outs) == 0
+    assert in_c("contacts", 1, state, 0.0, 5.0, np.empty(1), *outs) == 0
+    assert in_c.predict(state[0], covariance, TIMES)[0] == 0
+    assert in_c.cross(state[0], covariance, np.array([1.0, 0.0, 0.0]), 1.0, 0)[0] == -1
+
+
+def test_a_flight_that_no_ball_had_is_no_success(tmp_path: Path) -> None:
+    """Backwards drag speeds a ball up: before the last 20 s there is none with 4 m/s; 0.1 s are usual."""
+    ball = InC(nominal_model(), tmp_path)
+    state, outs = np.array([[-1.0, 0.1, 0.3, 4.0, 0.2, 1.0, 0.0, 60.0, 0.0]]), (np.empty((1, 9)), np.empty((1, 9, 9)))
+    assert [ball("flights", 1, state, np.array([dt]), *outs) for dt in (-20.0, -0.1, 20.0)] == [0, 1, 1]
+    assert np.isfinite(outs[0]).all()
+    (_, covariance), *_ = shots(1)
+    for speed in (1e4, 1e160):
+        state[0, 3] = speed
+        assert ball("flights", 1, state, np.array([20.0]), *outs) == 0
+        done, means, spreads = ball.predict(state[0], covariance, TIMES)
+        assert done < len(TIMES)
+        assert np.isfinite(means).all()
+        assert np.isfinite(spreads).all()
+
+
 def test_header(in_c: InC, tmp_path: Path) -> None:
     """The same bytes again, less than 200 kB, and C++ as well."""
     assert in_c.text == c_header(in_c.model, "ball")
