@@ -80,6 +80,8 @@ class Trainee(ABC):
     """
 
     module: nn.Module
+    read_by: ClassVar[str] = ""
+    """What reads the written model, if no command does."""
 
     @abstractmethod
     def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:

@@ -56,7 +56,7 @@ def load_model(
     """
     path = check_path("path", path)
     if path.is_dir():
-        raise FileNotFoundError(f"model file must be one YAML file; {path} is a folder. Give a file in it.")
+        raise FileNotFoundError(f"model file must be one YAML file; {path} is a folder. {_file_of(path)}")
     if not path.is_file():
         raise FileNotFoundError(f"model file {path} does not exist; a model is one YAML file")
     content = read_yaml(path)
@@ -81,6 +81,18 @@ def load_model(
     if abroad and isinstance(model, LearnedModel) and model.fading is not None:
         model.fading.strength = float(model.fading.get_buffer("abroad"))
     return model
+
+
+def _file_of(folder: Path) -> str:
+    """What to give in place of a folder."""
+    if (folder / "model.yaml").is_file():
+        return f"Give {folder / 'model.yaml'}."
+    if (folder / "weights.safetensors").is_file():
+        return (
+            "It holds weights: give the model file beside it that names it. Models of kind lstm or diffusion have "
+            "none: SequencePredictor.load of ballfg.learning.sequence.predictor reads them, and no command does."
+        )
+    return "Give a file in it."
 
 
 def model_from_dict(

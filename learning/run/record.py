@@ -115,6 +115,7 @@ class Record:
             print("no validation track could be judged: the weights are those of the last epoch")
         kept = "the calibrated model" if self.start else "the model before the first step, which no epoch improved"
         what = kept if better is False else "the trained model"
+        what += f", for {task.trainee.read_by}; no command reads it" if task.trainee.read_by else ""
         print(f"{folder / files.PAGE}: the training, to read")
         print(f"{model}: {what}\n{folder / files.METRICS}: all numbers\n{folder / files.CURVES}")
         return NOT_BETTER if better is False else 0

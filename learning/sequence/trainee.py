@@ -34,6 +34,7 @@ class SequenceTrainee(Trainee):
     """
 
     module: SequenceModel
+    read_by = "SequencePredictor.load of ballfg.learning.sequence.predictor"
 
     def __init__(
         self,

@@ -84,6 +84,13 @@ def test_missing_file(tmp_path):
         load_model(tmp_path / "none.yaml")
     with pytest.raises(FileNotFoundError, match=r"must be one YAML file; .* is a folder\. Give a file in it\.$"):
         load_model(tmp_path)
+    (tmp_path / "model.yaml").mkdir()  # no file: nothing to give
+    with pytest.raises(FileNotFoundError, match=r"Give a file in it\.$"):
+        load_model(tmp_path)
+    (tmp_path / "model.yaml").rmdir()
+    (tmp_path / "model.yaml").write_text("flight: {}")
+    with pytest.raises(FileNotFoundError, match=rf"is a folder\. Give {tmp_path}/model\.yaml\.$"):
+        load_model(tmp_path)
 
 
 @pytest.mark.parametrize(

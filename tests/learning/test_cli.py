@@ -16,7 +16,11 @@ from ballfg.dynamics import load_model
 from ballfg.learning.calibration import run as calibration
 from ballfg.learning.calibration.coefficients import values_of
 from ballfg.learning.cli import run
+from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run import run_folder as files
+from ballfg.learning.run.training import run_training
+from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.progress import unwatched
 
 SHORT = ("max_iterations=2", "tolerance=1e-12", "jobs=1", "coefficients=[flight.drag.k,bounce.restitution.e]")
 
@@ -44,6 +48,25 @@ def finished(config: Path, few_tracks: Path, tmp_path_factory: pytest.TempPathFa
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_sequence_model_is_for_python_alone(
+    few_tracks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The last lines of its training say what reads it, and so do commands that get it."""
+    settings = TrainConfig.model_validate(
+        {"kind": "lstm", "data": [str(few_tracks)], "observe": {"samples": 25}, "optimizer": {"epochs": 1}, "jobs": 1}
+    )
+    run_training(settings, tmp_path / "run", watch=unwatched)
+    model = tmp_path / "run" / "model"
+    reader = "SequencePredictor.load of ballfg.learning.sequence.predictor"
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith(f"{model}: "))
+    assert line.endswith(f", for {reader}; no command reads it")
+    assert SequencePredictor.load(model).architecture.kind == "lstm"
+    options = ("--observe", 0.3, "--model", model, "--out", tmp_path / "p.csv")
+    assert status("predict", few_tracks, *options, command=ballfg) == 2
+    assert f"{model} is a folder. It holds weights: " in (said := capsys.readouterr().err)
+    assert f"Models of kind lstm or diffusion have none: {reader} reads them" in said
 
 
 def test_a_run_writes_all_its_files(finished: Path, few_tracks: Path, tmp_path: Path) -> None:
