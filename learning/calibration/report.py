@@ -185,7 +185,10 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
         )
     for name, one in found.items():
         if not one["told_by_data"] and (problem.correction is None or name != SCALE):
-            sentences.append(f"The tracks say little of {name}: its value is the model's.")
+            before_it, after_it = (f"{one[when]:.4g}" for when in ("before", "after"))
+            moved = f"{after_it} is hardly surer than the model's {before_it}"
+            known = "its value is the model's" if before_it == after_it else moved
+            sentences.append(f"The tracks say little of {name}: {known}.")
     return " ".join(sentences)
 
 

@@ -102,6 +102,10 @@ def test_what_is_not_known_is_said(problem: Problem) -> None:
         f"iteration 4: continue with a larger max_iterations. The tracks say little of {chosen.names[1]}: its value is "
         "the model's."
     )
+    start, sigma = float(chosen.start[1]), 0.99 * float(chosen.sigma[1])
+    moved = verdict(problem, step(problem, mean_1=start + 0.2 * sigma, sigma_1=sigma), NONE)
+    number = f"{start + 0.2 * sigma:.4g}"
+    assert f"little of {chosen.names[1]}: {number} is hardly surer than the model's {start:.4g}." in moved
 
 
 def test_errors_before_and_after_stand_side_by_side(problem: Problem) -> None:
