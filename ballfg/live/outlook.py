@@ -15,13 +15,11 @@ from ballfg.estimation.result import Status
 from ballfg.live.tracker import BallUpdate
 from ballfg.prediction import BallState, apex, next_contact
 from ballfg.prediction.crossing import Crossing
-from ballfg.prediction.event_ahead import APEX, CONTACT, EventAhead, event_on
+from ballfg.prediction.event_ahead import APEX, CONTACT, EventAhead, Path, event_on
 from ballfg.prediction.forecast import carried_by
 from ballfg.prediction.plane import Plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
-GRID = 0.02
-"""s between the times of a path, a step of the motion. At half of it those of measured tracks differ by 4e-6."""
 VAGUE = 3.0  # m/s, standard deviation of the velocity beyond which predictions carry no information
 
 
@@ -63,14 +61,14 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
 
 
 def _finders(state: OnlineState, horizon: float, plane: Plane | None) -> dict[str, Callable[[], EventAhead]]:
-    """What finds each event. Probabilities need the whole path, which is predicted only where a plane is asked for."""
+    """What finds each event. Probabilities need possible balls, which are moved only where a plane is asked for."""
+    carried = carried_by(state)
     if plane is None:
-        carried = carried_by(state)
         return {
             "bounce": lambda: EventAhead(next_contact(*carried, horizon), math.nan),
             "apex": lambda: EventAhead(apex(*carried, horizon), math.nan),
         }
-    path = state.predict(horizon, GRID).path()
+    path = Path(carried, horizon)
     asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
     return {what: partial(event_on, path, event) for what, event in asked.items()}
 

@@ -61,10 +61,7 @@ class Belief:
                 )
         bounded = AugmentedModel(model, names) if names else model
         prior_mean = np.array([float(model.get_parameter(name).detach()) for name in names])
-        known = model.declared_coefficients()
-        declared = [known.get(name) for name in names]
-        low = np.array([-np.inf if c is None else c.low for c in declared])
-        high = np.array([np.inf if c is None else c.high for c in declared])
+        low, high = _bounds(model, names)
         joints = [_joint(state, names, prior_mean, np.array(list(prior.values()))) for state in states]
         mean = np.stack([_held(m, covariance, low, high) for m, covariance in joints])
         return cls(
@@ -73,6 +70,13 @@ class Belief:
             torch.from_numpy(mean),
             torch.from_numpy(np.stack([covariance for _, covariance in joints])),
         )
+
+    def within_bounds(self, states: Array) -> Array:
+        """States and coefficients (n, 9 + p) with coefficients beyond the bounds of their effects moved to these."""
+        if not isinstance(self.model, AugmentedModel):
+            return states
+        held = np.clip(states[:, STATE_DIM:], *_bounds(self.model.model, self.model.names))
+        return np.concatenate((states[:, :STATE_DIM], held), axis=1)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -102,6 +106,14 @@ class Belief:
             rows: their (m,) indices, a (n,) mask or a slice.
         """
         return replace(self, time=self.time[rows], mean=self.mean[rows], covariance=self.covariance[rows])
+
+
+def _bounds(model: BallModel, names: tuple[str, ...]) -> tuple[Array, Array]:
+    """Least and largest values (p,) of coefficients by their effects."""
+    known = model.declared_coefficients()
+    declared = [known.get(name) for name in names]
+    low = np.array([-np.inf if c is None else c.low for c in declared])
+    return low, np.array([np.inf if c is None else c.high for c in declared])
 
 
 def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_sigma: Array) -> tuple[Array, Array]:

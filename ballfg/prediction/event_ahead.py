@@ -1,28 +1,35 @@
 """Answers how probable an event ahead is: a contact, an apex, or the crossing of a plane within the horizon.
 
-Each event is a number that falls through zero: the height above a surface, the vertical velocity, the distance from a
-plane. Its mean and standard deviation along the path give the probability that it is positive at some time and negative
-later. A ball that may miss a plane has an event with a small probability, or none on its mean path.
+An event is a number that goes through zero: the vertical velocity, the distance from a plane. Some dozen possible balls
+are moved through bounces and past edges, and those that have the event are counted. A ball that may miss a plane has an
+event with a small probability, or none on its mean path.
 """
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeAlias
+from functools import cache, cached_property
+from statistics import NormalDist
+from typing import Final, TypeAlias
 
 import numpy as np
+import torch
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
+from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
+from ballfg.dynamics.motion.rollout import is_resting, place_on
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
 from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ
 
-if TYPE_CHECKING:
-    from ballfg.prediction.state import BallState
-
 APEX, CONTACT = "apex", "next-contact"
-HALF: Final = 0.5  # Least probability of an event on the mean path
+PAIRS: Final = 64  # Least number of pairs of possible balls, opposite about the mean; shares are right to some 0.03
+STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is right to 0.2 mm after one
+SPANS: Final = 6  # Number of parts of the horizon in which a possible ball has a random acceleration each
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
 Carried: TypeAlias = tuple[Propagator, Belief]
@@ -50,7 +57,7 @@ def event_on(path: "Path", asked: Plane | str) -> EventAhead:
     if isinstance(asked, Plane):
         return _crossing(path, asked)
     if asked == APEX:
-        return EventAhead(apex(*path.carried, path.horizon), falls(*path.along(np.eye(STATE_DIM)[VZ], 0.0)))
+        return EventAhead(apex(*path.carried, path.horizon), path.probability(np.eye(STATE_DIM)[VZ], 0.0, "down"))
     return path.contact()
 
 
@@ -62,11 +69,6 @@ def crossing_of(carried: Carried, plane: Plane, horizon: float) -> Crossing | No
         if contact is None:
             return None
         since = contact.time
-    return _crossed(carried, plane, horizon, since)
-
-
-def _crossed(carried: Carried, plane: Plane, horizon: float, since: float) -> Crossing | None:
-    """The first crossing of a plane after a time, s; bounces before it have been counted."""
     return plane_crossing(*carried, plane.normal, plane.offset, horizon, after=since, direction=plane.direction)
 
 
@@ -88,77 +90,98 @@ def event_numbers(found: Crossing | None) -> dict[str, float]:
     return numbers | {f"cov_{AXES[i]}{AXES[j]}": float(spread[i, j]) for i, j in ((0, 1), (0, 2), (1, 2))}
 
 
-def falls(value: Array, sigma: Array) -> float:
-    """Probability that a number is positive at some time and negative at a later one.
+@cache
+def normal_points(pairs: int, width: int, seed: int = 0) -> Array:
+    """(2 pairs, width) points of a standard normal, each with its negative; mean and covariance are exactly right.
 
-    Errors last along a path: one that is high by a share of its standard deviation is so at all times. A path at the
-    quantile u then falls through zero if u lies between the quantiles that are zero at two times, the later one higher.
-
-    Args: value, sigma: (k,) mean and standard deviation at k times.
+    Args: width: at most the number of pairs.
     """
-    from scipy import special  # it takes a tenth of a second to import
+    rng, normal = np.random.default_rng(seed), NormalDist()
+    half = np.array([normal.inv_cdf(0.5 + (k + 0.5) / (2 * pairs)) for k in range(pairs)])
+    points = np.stack([rng.permutation(half) * rng.choice((-1.0, 1.0), pairs) for _ in range(width)], axis=1)
+    across, mixed = np.linalg.qr(points)
+    points = np.sqrt(pairs) * across * np.sign(np.diagonal(mixed))
+    return np.concatenate((points, -points))
 
-    above = special.ndtr(value / np.maximum(sigma, np.finfo(float).tiny))
-    lowest = np.minimum.accumulate(above[::-1])[::-1]  # from each time on
-    covered, reached = 0.0, np.inf
-    falling = above[:-1] > lowest[1:]
-    for high, low in sorted(zip(above[:-1][falling].tolist(), lowest[1:][falling].tolist(), strict=True), reverse=True):
-        covered += max(min(high, reached) - low, 0.0)
-        reached = min(reached, low)
-    return covered
+
+def _root(covariance: Array) -> Array:
+    """Root (d, d) of a covariance, which may be singular."""
+    sigmas = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    scale = np.where(sigmas > 0.0, sigmas, 1.0)
+    values, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
+
+
+@torch.no_grad()
+def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
+    """States and coefficients (n, 9 + p) at some errors; if the mean lies on a surface, so do all."""
+    mean, model = belief.mean, belief.model
+    start = mean + torch.from_numpy(errors)
+    if abs(float(mean[0, VZ])) <= REST_SPEED:
+        level = surfaces.level_below(mean, model.surface_offset(mean))
+        if bool(is_resting(model, mean, level)):
+            start = place_on(model, start, level)
+    return belief.within_bounds(start.numpy())
+
+
+def _below(quantile: float) -> float:
+    """Share of a standard normal below a number."""
+    return 0.5 * math.erfc(-quantile / math.sqrt(2.0))
 
 
 @dataclass(frozen=True)
 class Path:
-    """Means (k, 9) and covariances (k, 9, 9) of the state at times (k,) s after the start, and what carries it."""
+    """The way of a ball ahead: what carries it on, up to a horizon, s."""
 
-    start: "BallState"
     carried: Carried
-    times: Array
-    states: Array
-    covariances: Array
+    horizon: float
 
-    @property
-    def horizon(self) -> float:
-        """Range of the search, s."""
-        return float(self.times[-1] - self.start.time)
+    @cached_property
+    def possible(self) -> Scattered:
+        """Paths of possible balls: at starts that the belief holds, with random accelerations, kicks and ends."""
+        (propagator, belief), horizon = self.carried, min(self.horizon, LONGEST_MOTION)
+        noise, surfaces, d = density_of(propagator.noise), propagator.surfaces, belief.mean.shape[1]
+        pairs = max(PAIRS, d)
+        steps = max(math.ceil(horizon / STEP - 1e-9), 1)
+        spans = np.arange(steps) * min(SPANS, steps) // steps  # of lasting pushes, by step
+        h, lasting = horizon / steps, np.bincount(spans)
+        kicks, ends, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
+        pushes = pushed.reshape(2 * pairs, SPANS, 3)[:, : len(lasting)] * (noise[0] / np.sqrt(h * lasting))[:, None]
+        off = ends * surfaces.edge_sigmas if any(surfaces.edge_sigmas) else np.zeros_like(ends)
+        start = _placed(belief, normal_points(pairs, d) @ _root(belief.covariance[0].detach().numpy()).T, surfaces)
+        chance = (pushes[:, spans], kicks * noise[[3, 3, 2]], off)
+        return Scattered.of(belief.model, start, h, chance, surfaces)
 
-    def along(self, line: Array, offset: float, since: float = -np.inf) -> tuple[Array, Array]:
-        """(j,) mean and standard deviation of line (9,) . state - offset, at the start and after it, from a time on."""
-        states = np.concatenate((self.start.state[None], self.states))
-        covariances = np.concatenate((self.start.covariance[None], self.covariances))
-        later = np.append(self.start.time, self.times) > since
-        spread = np.einsum("i,kij,j->k", line, covariances[later], line)
-        return states[later] @ line - offset, np.sqrt(np.maximum(spread, 0.0))
+    def probability(self, line: Array, offset: float, direction: str, after: int = 0) -> float:
+        """Share of balls whose line (9,) . state goes through an offset in a direction, after a number of bounces."""
+        balls = self.possible
+        value, rate = balls.states @ line - offset, balls.states[..., VELOCITY] @ line[POSITION]
+        before, later = rate[:, :-1], rate[:, 1:]
+        turns = before * later < 0.0  # the highest or lowest point between two moments, of a parabola
+        turn = np.where(turns, 0.5 * before**2 * np.diff(balls.times) / np.where(turns, before - later, 1.0), 0.0)
+        values = np.empty((len(value), 2 * value.shape[1] - 1))
+        values[:, ::2], values[:, 1::2] = value, value[:, :-1] + turn
+        counts = np.repeat(balls.met >= after, 2, axis=1)[:, :-1]
+        above, below = (values > 0.0) & counts, (values < 0.0) & counts
+        if direction == "either":
+            return float((above.any(axis=1) & below.any(axis=1)).mean())
+        first, then = (above, below) if direction == "down" else (below, above)
+        return float((np.maximum.accumulate(first, axis=1) & then).any(axis=1).mean())
 
     def contact(self, since: float = -np.inf) -> EventAhead:
         """The next contact after a time, s, and the probability that its uncertain time lies within the horizon."""
-        from scipy import special
-
         found = next_contact(*self.carried, self.horizon + LATER, after=since)
         if found is None:
             return EventAhead(None, 0.0)
-        left = float(self.times[-1]) - found.time
-        sooner = float(special.ndtr(left / max(found.time_sigma, np.finfo(float).tiny)))
+        left = float(self.carried[1].time) + self.horizon - found.time
+        sooner = _below(left / max(found.time_sigma, np.finfo(float).tiny))
         return EventAhead(found if left >= 0.0 else None, sooner)
 
 
 def _crossing(path: Path, plane: Plane) -> EventAhead:
     """The crossing of a plane, after its number of bounces."""
-    since, chance = -np.inf, 1.0
-    for _ in range(plane.after):
-        contact = path.contact(since)
-        chance *= contact.probability
-        if contact.crossing is None:
-            return EventAhead(None, 0.0)
-        since = contact.crossing.time
     normal, offset = plane.line
     line = np.zeros(STATE_DIM)
     line[POSITION] = normal
-    value, sigma = path.along(line, offset, since)
-    down, up = falls(value, sigma), falls(-value, sigma)
-    ways = {"down": down, "up": up, "either": max(down, up)}
-    found = _crossed(path.carried, plane, path.horizon, since)
-    # the mean path may cross between two of its times, as close to a table it does
-    least = 0.0 if found is None else HALF
-    return EventAhead(found, chance * max(ways[plane.direction], least))
+    found = crossing_of(path.carried, plane, path.horizon)
+    return EventAhead(found, path.probability(line, offset, plane.direction, plane.after))

@@ -109,11 +109,15 @@ class Forecast:
         if not isinstance(asked, Plane):
             check_text("asked", asked)
             asked = asked_event(asked)
-        return event_on(self.path(), asked)
+        return event_on(self._path, asked)
 
     def path(self) -> Path:
         """The path for several events."""
-        return Path(self.start, self._carried, self.times, self.states, self.covariances)
+        return self._path
+
+    @cached_property
+    def _path(self) -> Path:
+        return Path(self._carried, self.horizon)
 
     def to_frame(self) -> "DataFrame":
         """A pandas table: t, x, y, z and sigma_x, sigma_y, sigma_z, s and m, one row a time.

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import rollout
+from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState, Plane, plane_crossing
-from ballfg.prediction.event_ahead import EventAhead, event_numbers, falls
+from ballfg.prediction.event_ahead import PAIRS, EventAhead, Path, event_numbers, normal_points
+from ballfg.prediction.forecast import carried_by
 from ballfg.prediction.state import World
 from ballfg.state import POSITION, VZ
+from tests.prediction.conftest import NEARLY_EXACT
 
 G = 9.81
 MEAN = np.array([0.0, 0.0, 0.3, 3.0, 0.0, 2.5, 0.0, 0.0, 0.0])
@@ -149,13 +155,92 @@ def test_a_ball_at_rest_meets_nothing(world):
     assert lying.predict(0.5).event("next-contact").probability == 0.0
 
 
-def test_errors_that_last_fall_through_zero_in_the_quantiles_between():
-    value, sigma = np.array([-1.0, 1.0, -0.5]), np.ones(3)
-    assert falls(value, sigma) == pytest.approx(0.841345 - 0.308538, abs=1e-6)  # Phi(1) - Phi(-0.5)
-    assert falls(-value[::-1], sigma) == pytest.approx(0.841345 - 0.158655, abs=0.2)
-    assert falls(np.linspace(-2.0, 2.0, 9), np.ones(9)) == 0.0
-    two_humps = np.array([1.0, -1.0, 2.0, -2.0])
-    assert falls(two_humps, np.ones(4)) == pytest.approx(0.977250 - 0.022750, abs=1e-6)
+def test_points_stand_for_a_normal():
+    points = normal_points(PAIRS, 20)
+    assert points.mean(axis=0) == pytest.approx(0.0, abs=1e-9)
+    assert points.T @ points / len(points) == pytest.approx(np.eye(20), abs=1e-9)
+    for way in (np.eye(20)[3], np.array([0.6, 0.0, -0.8, *[0.0] * 17])):
+        for quantile in (-1.5, -0.5, 0.5, 1.5):
+            assert (points @ way < quantile).mean() == pytest.approx(stats.norm.cdf(quantile), abs=0.06)
+
+
+FALLING = np.array([0.0, 0.0, 0.3, 3.0, 0.0, -0.5, 0.0, 0.0, 0.0])
+SCENES = {
+    "falling": (FALLING, 0.1, Surfaces(0.0), 1.0, (
+        "z=0.01,down", "z=0.021,down", "z=0.05,down", "z=0.1,down", "z=0.15,up", "z=0.22,up", "z=0.25,up", "z=0.22",
+        "z=0.22,down,after=1", "z=0.05,down,after=1", "z=0.05,down,after=2", "z=0.1,up,after=2", "z=0.302,down",
+        "x=2.0", "x=2.7",
+    )),
+    "rising": (MEAN, 0.3, Surfaces(0.0), 0.62, (
+        "z=0.05,down", "z=0.1,down", "z=0.58,down", "z=0.7,up", "z=0.05,up,after=1", "x=1.6", "x=1.7",
+    )),
+    "at the end of a table": (FALLING, 0.2, Surfaces(0.0, -0.76, (-2.0, 0.6, -0.7, 0.7)), 0.4, (
+        "z=-0.3,down", "z=-0.02,down", "z=0.1,up", "z=0.05,down",
+    )),
+    "over the end of a table": (FALLING, 0.2, Surfaces(0.0, -0.76, (-2.0, 0.68, -0.7, 0.7)), 1.0, (
+        "z=-0.3,down", "z=-0.3,down,after=1", "z=0.03,down",
+    )),
+}  # fmt: skip
+"""By name: mean, sigma of the velocity in m/s, surfaces, horizon in s, planes."""
+
+
+@pytest.fixture(scope="module", params=list(SCENES))
+def scene(request, world):
+    """The ball of a scene, its planes, and (balls, times, 9) rollouts of balls of the same distribution."""
+    mean, vague, surfaces, horizon, planes = SCENES[request.param]
+    sigmas = np.array([0.01] * 3 + [vague] * 3 + [20.0] * 3)
+    ball = BallState(0.0, mean, np.diag(sigmas**2), (), World(world.model, surfaces, NEARLY_EXACT))
+    first = torch.from_numpy(mean + sigmas * np.random.default_rng(3).standard_normal((DRAWS // 2, 9)))
+    times = torch.linspace(0.0025, horizon, round(horizon / 0.0025), dtype=torch.float64)
+    later = rollout(world.model, first, times, surfaces).numpy()
+    return ball, horizon, planes, np.concatenate((first.numpy()[:, None], later), axis=1)
+
+
+def share_through(states, plane):
+    """Share of balls (balls, times, 9) that go through a plane in its direction after its bounces."""
+    (normal, offset), speeds = plane.line, states[..., VZ]
+    bounced = np.cumsum((speeds[:, :-1] < 0.0) & (np.diff(speeds) > 0.1), axis=1)
+    counts = np.pad(bounced, ((0, 0), (1, 0))) >= plane.after
+    above, below = ((side * (states[..., POSITION] @ normal - offset) > 0.0) & counts for side in (1.0, -1.0))
+    ways = [(first & ~second, second) for first, second in ((above, below), (below, above))]
+    fell, rose = ((np.maximum.accumulate(first, axis=1) & second).any(axis=1) for first, second in ways)
+    return {"down": fell, "up": rose, "either": fell | rose}[plane.direction].mean()
+
+
+def test_probabilities_are_the_shares_of_balls_of_the_belief(scene):
+    """Within the band of 99.9 % for as many balls as are moved, and without doubt where all or none have the event."""
+    ball, horizon, planes, states = scene
+    ahead, count = ball.predict(horizon), 2 * PAIRS
+    for text in planes:
+        told, share = ahead.event(text).probability, share_through(states, Plane.parse(text))
+        low, high = stats.binom.interval(0.999, count, share) if 0.0 < share < 1.0 else (count * share, count * share)
+        assert low <= count * told <= high, (text, told, share)
+
+
+@pytest.mark.parametrize("mean", [[0.0, 0.0, 9.0, 3.0, 0.5, 1.0, 0.0, 0.0, 0.0], FALLING])
+def test_possible_balls_have_the_noise_of_the_motion(world, mean):
+    """In flight, and after a bounce: an exactly known ball is as uncertain as its prediction later."""
+    noise = ProcessNoise(acceleration=0.1, contact_velocity=0.05, contact_tangential=0.1)
+    ball = BallState(0.0, np.array(mean), 1e-16 * np.eye(9), (), World(world.model, Surfaces(0.0), noise))
+    balls = Path(carried_by(ball), 0.48).possible
+    there = ball.predict(0.48, 0.48)
+    spread = balls.states[:, -1, :6].std(axis=0)
+    assert spread[:3] == pytest.approx(there.sigmas[-1], rel=0.1)
+    assert spread[3:] == pytest.approx(np.sqrt(np.diagonal(there.covariances[-1]))[3:6], rel=0.15)
+    assert np.unique(balls.met[:, -1]).tolist() == [float(mean is FALLING)]
+
+
+def test_a_ball_that_rolls_falls_off_the_end(world):
+    """It neither hops nor has an apex; every ball gets to the end within the horizon, or none does."""
+    height = 0.02 + float(world.model.surface_offset(torch.zeros(1, 9, dtype=torch.float64)))
+    mean = np.array([0.0, 0.0, height, 0.8, *[0.0] * 5])
+    surfaces = Surfaces(0.0, -0.76, (-2.0, 0.2, -0.7, 0.7))
+    rolling = BallState(0.0, mean, np.diag([1e-8] * 9), (), World(world.model, surfaces))
+    ahead = rolling.predict(1.0)
+    assert ahead.event("z=-0.3,down").probability == 1.0
+    assert ahead.event("apex").probability == 0.0
+    long_table = replace(rolling, world=World(world.model, Surfaces(0.0, -0.76, (-2.0, 5.0, -0.7, 0.7))))
+    assert long_table.predict(1.0).event("z=-0.3,down").probability == 0.0
 
 
 def test_numbers_of_an_event_are_those_of_its_state(start):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final, Self
 
 import numpy as np
 import torch
@@ -13,10 +13,13 @@ from ballfg.dynamics.compiled.beliefs.events import find
 from ballfg.dynamics.compiled.beliefs.mixture import mix
 from ballfg.dynamics.compiled.in_torch import functions_for, raise_errors
 from ballfg.dynamics.compiled.motion import Moving, world_of
+from ballfg.dynamics.compiled.roll_out import scatter
 from ballfg.dynamics.compiled.signatures import GIVEN
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import STATE_DIM, Z
+
+ENDS: Final = slice(3, 7)  # Of a world for machine code: the ends of the table
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,43 @@ class Carrier:
         mix(*self._given, self._world, self._noise, *(getattr(copied, f.name) for f in fields(Course)))
         raise_errors()
         return copied
+
+
+@dataclass(frozen=True)
+class Scattered:
+    """Paths of n possible balls through k moments, with one on each side of a bounce.
+
+    Attributes: times: (n, k) s since the start.  states: (n, k, 9).  met: (n, k) number of bounces so far.
+    """
+
+    times: Array
+    states: Array
+    met: Array
+
+    @classmethod
+    def of(
+        cls, model: BallModel, start: Array, h: float, chance: tuple[Array, Array, Array], surfaces: Surfaces
+    ) -> Self:
+        """The paths from start (n, 9 + p) on, in steps of h s.
+
+        Args:
+            chance: pushes (n, steps, 3) m/s^2, kicks (n, 3) m/s and by how far the ends of the table are off (n, 4) m.
+        """
+        pushes, kicks, ends = chance
+        functions, (n, steps) = functions_for(model), pushes.shape[:2]
+        worlds = np.tile(world_of(surfaces, functions.radius), (n, 1))
+        worlds[:, ENDS] += ends
+        moving = Moving(model, functions, torch.from_numpy(start), 0)
+        states, times, met = np.empty((n, steps, 3, STATE_DIM)), np.empty((n, steps, 3)), np.empty((n, steps, 3))
+        first = np.ascontiguousarray(start[:, :STATE_DIM])
+        scatter(*moving.laws, first, h, np.ascontiguousarray(pushes), kicks, worlds, states, times, met)
+        raise_errors()
+        nodes = (n, 3 * steps)
+        return cls(
+            np.concatenate((np.zeros((n, 1)), times.reshape(nodes)), axis=1),
+            np.concatenate((first[:, None], states.reshape(*nodes, STATE_DIM)), axis=1),
+            np.concatenate((np.zeros((n, 1)), met.reshape(nodes)), axis=1),
+        )
 
 
 def density_of(noise: Any) -> Array:
