@@ -13,9 +13,9 @@ from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
 from ballfg.live.tracker import BallUpdate
-from ballfg.prediction import BallState, apex, next_contact
+from ballfg.prediction import BallState, apex
 from ballfg.prediction.crossing import Crossing
-from ballfg.prediction.event_ahead import APEX, CONTACT, EventAhead, Path, event_on
+from ballfg.prediction.event_ahead import APEX, CONTACT, EventAhead, Path, contact_ahead, event_on
 from ballfg.prediction.forecast import carried_by
 from ballfg.prediction.plane import Plane
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -65,10 +65,10 @@ def _finders(state: OnlineState, horizon: float, plane: Plane | None) -> dict[st
     carried = carried_by(state)
     if plane is None:
         return {
-            "bounce": lambda: EventAhead(next_contact(*carried, horizon), math.nan),
+            "bounce": lambda: EventAhead(*contact_ahead(state, carried, horizon)),
             "apex": lambda: EventAhead(apex(*carried, horizon), math.nan),
         }
-    path = Path(carried, horizon)
+    path = Path(state, carried, horizon)
     asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
     return {what: partial(event_on, path, event) for what, event in asked.items()}
 

@@ -6,10 +6,10 @@ event with a small probability, or none on its mean path.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from statistics import NormalDist
-from typing import Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 import torch
@@ -26,12 +26,16 @@ from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ
 
+if TYPE_CHECKING:
+    from ballfg.prediction.state import BallState
+
 APEX, CONTACT = "apex", "next-contact"
 PAIRS: Final = 64  # Least number of pairs of possible balls, opposite about the mean; shares are right to some 0.03
 STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is right to 0.2 mm after one
 SPANS: Final = 6  # Number of parts of the horizon in which a possible ball has a random acceleration each
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
+MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce
 Carried: TypeAlias = tuple[Propagator, Belief]
 
 
@@ -58,7 +62,7 @@ def event_on(path: "Path", asked: Plane | str) -> EventAhead:
         return _crossing(path, asked)
     if asked == APEX:
         return EventAhead(apex(*path.carried, path.horizon), path.probability(np.eye(STATE_DIM)[VZ], 0.0, "down"))
-    return path.contact()
+    return EventAhead(*contact_ahead(path.start, path.carried, path.horizon))
 
 
 def crossing_of(carried: Carried, plane: Plane, horizon: float) -> Crossing | None:
@@ -70,6 +74,52 @@ def crossing_of(carried: Carried, plane: Plane, horizon: float) -> Crossing | No
             return None
         since = contact.time
     return plane_crossing(*carried, plane.normal, plane.offset, horizon, after=since, direction=plane.direction)
+
+
+def contact_ahead(start: "BallState", carried: Carried, horizon: float) -> tuple[Crossing | None, float]:
+    """The next contact within a horizon, s, and the probability that there is one.
+
+    While the state is in doubt whether the ball has bounced just now, a ball on the other side has another contact: the
+    bounce itself, or the one after it. The numbers of the mean's contact then spread to that one too.
+    """
+    found, end = next_contact(*carried, horizon + LATER), start.time + horizon
+    chance = 0.0 if found is None else _sooner(found, end - found.time)
+    share, other = _other_contact(start, carried, found, horizon)
+    if other is not None:
+        chance += share * (_sooner(other, end - other.time) - chance)
+        if found is not None:
+            off, late = other.state - found.state, other.time - found.time
+            time_sigma = math.hypot(found.time_sigma, math.sqrt(share) * late)
+            found = replace(found, time_sigma=time_sigma, covariance=found.covariance + share * np.outer(off, off))
+    return (None if found is None or found.time > end else found), chance
+
+
+def _sooner(found: Crossing, left: float) -> float:
+    """Probability that an event is less than some s later than it is expected."""
+    return 0.5 * math.erfc(-left / (math.sqrt(2.0) * max(found.time_sigma, np.finfo(float).tiny)))
+
+
+@torch.no_grad()
+def _other_contact(
+    start: "BallState", carried: Carried, found: Crossing | None, horizon: float
+) -> tuple[float, Crossing | None]:
+    """The share of balls on the other side of a present bounce, and their next contact; None without any doubt.
+
+    The share follows from the variance of the vertical speed that the doubt gives and the jump of that speed.
+    """
+    variance, belief = 0.0 if start.other_side is None else float(start.other_side[VZ, VZ]), carried[1]
+    rises, before = float(start.state[VZ]) > 0.0, belief.mean.clone()
+    if variance <= 0.0 or (found is None and not rises):
+        return 0.0, None
+    if found is not None and not rises:
+        before[0, :STATE_DIM] = torch.from_numpy(found.state)
+        other = next_contact(*carried, horizon + LATER, after=found.time)
+    else:
+        before[0, VZ] *= -1.0
+        before[0, VZ] *= float(before[0, VZ] / belief.model.after_bounce(before)[0, VZ]) * -1.0
+        other = Crossing(start.time, 0.0, before[0, :STATE_DIM].numpy(), start.covariance)
+    jump = float(belief.model.after_bounce(before)[0, VZ] - before[0, VZ])
+    return min(variance / jump**2, MOST), other
 
 
 def event_numbers(found: Crossing | None) -> dict[str, float]:
@@ -124,15 +174,11 @@ def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
     return belief.within_bounds(start.numpy())
 
 
-def _below(quantile: float) -> float:
-    """Share of a standard normal below a number."""
-    return 0.5 * math.erfc(-quantile / math.sqrt(2.0))
-
-
 @dataclass(frozen=True)
 class Path:
-    """The way of a ball ahead: what carries it on, up to a horizon, s."""
+    """The way of a ball ahead: what carries it on from the start, up to a horizon, s."""
 
+    start: "BallState"
     carried: Carried
     horizon: float
 
@@ -167,15 +213,6 @@ class Path:
             return float((above.any(axis=1) & below.any(axis=1)).mean())
         first, then = (above, below) if direction == "down" else (below, above)
         return float((np.maximum.accumulate(first, axis=1) & then).any(axis=1).mean())
-
-    def contact(self, since: float = -np.inf) -> EventAhead:
-        """The next contact after a time, s, and the probability that its uncertain time lies within the horizon."""
-        found = next_contact(*self.carried, self.horizon + LATER, after=since)
-        if found is None:
-            return EventAhead(None, 0.0)
-        left = float(self.carried[1].time) + self.horizon - found.time
-        sooner = _below(left / max(found.time_sigma, np.finfo(float).tiny))
-        return EventAhead(found if left >= 0.0 else None, sooner)
 
 
 def _crossing(path: Path, plane: Plane) -> EventAhead:

@@ -10,8 +10,8 @@ from ballfg.arrays import Array
 from ballfg.checks import check_number, check_text
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
-from ballfg.prediction.crossing import Crossing, apex, next_contact
-from ballfg.prediction.event_ahead import Carried, EventAhead, Path, asked_event, crossing_of, event_on
+from ballfg.prediction.crossing import Crossing, apex
+from ballfg.prediction.event_ahead import Carried, EventAhead, Path, asked_event, contact_ahead, crossing_of, event_on
 from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.prediction.state import BallState
@@ -67,7 +67,7 @@ class Forecast:
     @cached_property
     def next_contact(self) -> Crossing | None:
         """The state right before the next contact with a surface; None if there is none within the horizon."""
-        return next_contact(*self._carried, self.horizon)
+        return contact_ahead(self.start, self._carried, self.horizon)[0]
 
     @cached_property
     def apex(self) -> Crossing | None:
@@ -117,7 +117,7 @@ class Forecast:
 
     @cached_property
     def _path(self) -> Path:
-        return Path(self._carried, self.horizon)
+        return Path(self.start, self._carried, self.horizon)
 
     def to_frame(self) -> "DataFrame":
         """A pandas table: t, x, y, z and sigma_x, sigma_y, sigma_z, s and m, one row a time.

@@ -39,7 +39,7 @@ class BallState:
         world: model, surfaces and noise for predictions; None without a model.
         name: of the track.
         other_side: (9, 9) part of the covariance for the chance that the ball is on the other side of a near contact,
-            or None. Predictions leave it out, since they follow both sides themselves.
+            or None. Predictions leave it out, since both sides soon move alike; the next contact alone has it.
     """
 
     time: float

@@ -12,7 +12,7 @@ from scipy import stats
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.factors.noise import ProcessNoise
-from ballfg.prediction import BallState, Plane, plane_crossing
+from ballfg.prediction import BallState, Plane, next_contact, plane_crossing
 from ballfg.prediction.event_ahead import PAIRS, EventAhead, Path, event_numbers, normal_points
 from ballfg.prediction.forecast import carried_by
 from ballfg.prediction.state import World
@@ -222,7 +222,7 @@ def test_possible_balls_have_the_noise_of_the_motion(world, mean):
     """In flight, and after a bounce: an exactly known ball is as uncertain as its prediction later."""
     noise = ProcessNoise(acceleration=0.1, contact_velocity=0.05, contact_tangential=0.1)
     ball = BallState(0.0, np.array(mean), 1e-16 * np.eye(9), (), World(world.model, Surfaces(0.0), noise))
-    balls = Path(carried_by(ball), 0.48).possible
+    balls = Path(ball, carried_by(ball), 0.48).possible
     there = ball.predict(0.48, 0.48)
     spread = balls.states[:, -1, :6].std(axis=0)
     assert spread[:3] == pytest.approx(there.sigmas[-1], rel=0.1)
@@ -241,6 +241,32 @@ def test_a_ball_that_rolls_falls_off_the_end(world):
     assert ahead.event("apex").probability == 0.0
     long_table = replace(rolling, world=World(world.model, Surfaces(0.0, -0.76, (-2.0, 5.0, -0.7, 0.7))))
     assert long_table.predict(1.0).event("z=-0.3,down").probability == 0.0
+
+
+@pytest.mark.parametrize("bounced", [False, True])
+def test_the_next_contact_is_in_doubt_with_the_present_one(world, bounced):
+    """The ball is about to bounce, or has just done so; with a chance of 0.2 it is the other way round."""
+    share, falling = 0.2, torch.tensor([[0.0, 0.0, 0.0205, 3.0, 0.0, -3.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    risen = world.model.after_bounce(falling)
+    own, other = (risen, falling) if bounced else (falling, risen)
+    jump = np.zeros(9)
+    jump[VZ] = float((other - own)[0, VZ])
+    sure = BallState(5.0, own[0].numpy(), 1e-6 * np.eye(9), (), world)
+    doubt = share * np.outer(jump, jump)
+    plain, torn = sure.predict(1.0), replace(sure, joint=sure.joint + doubt, other_side=doubt).predict(1.0)
+    told, first = torn.event("next-contact"), plain.next_contact
+    if bounced:
+        apart, away = first.time - 5.0, first.state[0]
+    else:
+        second = next_contact(*carried_by(sure), 1.0, after=first.time)
+        apart, away = second.time - first.time, second.state[0] - first.state[0]
+    assert told.crossing.time == torn.next_contact.time == first.time
+    assert told.crossing.time_sigma == pytest.approx(np.sqrt(share) * apart, rel=0.02)
+    assert np.sqrt(told.crossing.covariance[0, 0]) == pytest.approx(np.sqrt(share) * away, rel=0.02)
+    assert first.time_sigma < 0.01
+    soon = replace(torn, horizon=0.1)
+    assert soon.event("next-contact").probability == pytest.approx(share if bounced else 1.0 - share, abs=0.01)
+    assert (soon.next_contact is None) == bounced
 
 
 def test_numbers_of_an_event_are_those_of_its_state(start):
