@@ -1,8 +1,8 @@
 """Answers how probable an event ahead is: a contact, an apex, or the crossing of a plane within the horizon.
 
-An event is a number that goes through zero: the vertical velocity, the distance from a plane. A sample of possible balls
-is moved through bounces and past edges, and those that have the event are counted. A ball that may miss a plane has an
-event with a small probability, or none on its mean path.
+An event is a number that goes through zero: the vertical velocity, the distance from a plane. A sample of possible
+balls is moved through bounces and past edges, and those that have the event are counted. A ball that may miss a plane
+has an event with a small probability, or none on its mean path.
 """
 
 import math
