@@ -72,7 +72,11 @@ class Belief:
         )
 
     def within_bounds(self, states: Array) -> Array:
-        """States and coefficients (n, 9 + p) with coefficients beyond the bounds of their effects moved to these."""
+        """Balls whose coefficients lie within the bounds of their effects.
+
+        Args: states: (n, 9 + p) m, m/s, rad/s, then the coefficients in their own units.
+        Returns: (n, 9 + p), the same with coefficients beyond a bound moved to it.
+        """
         if not isinstance(self.model, AugmentedModel):
             return states
         held = np.clip(states[:, STATE_DIM:], *_bounds(self.model.model, self.model.names))
