@@ -75,7 +75,7 @@ class Belief:
         """Balls whose coefficients lie within the bounds of their effects.
 
         Args: states: (n, 9 + p) m, m/s, rad/s, then the coefficients in their own units.
-        Returns: (n, 9 + p), the same with coefficients beyond a bound moved to it.
+        Returns: (n, 9 + p) in the same units, with coefficients beyond a bound moved to it.
         """
         if not isinstance(self.model, AugmentedModel):
             return states
