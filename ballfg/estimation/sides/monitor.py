@@ -23,7 +23,7 @@ from ballfg.state import STATE_DIM, VZ
 NEGLIGIBLE: Final = 1e-6
 """Probability below which a side is neglected."""
 LEAST_SAMPLES: Final = 8
-LEAST_TIME: Final = 0.06
+LEAST_TIME: Final = 0.04
 """Samples and s within which the estimator must have found the contact. At 1000 Hz eight samples are over before a ball
 whose surface is known to 4 mm shows on which side it is."""
 MOST_REJECTED: Final = 2
