@@ -16,6 +16,8 @@ from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS, label_text
 
 FIRST_SAMPLES = 10  # Number of samples whose mean direction of flight is the launch direction
+SHOWN = 20.0
+"""Horizontal way of a ball, in standard deviations of a position, from which on its direction is known to 4 degrees."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,11 @@ def undirected_spin(spins: SpinPopulation, group: str | None) -> SpinLabel:
     moment = covariance + np.outer(mean, mean)
     level = (moment[0, 0] + moment[1, 1]) / 2.0
     return SpinLabel(mean * (0.0, 0.0, 1.0), np.sqrt([level, level, covariance[2, 2]]), measured=False)
+
+
+def shows_direction(way: NDArray[np.float64], sigma: float) -> bool:
+    """Whether a ball's way (3,) m shows the direction of its launch; sigma: m, of its positions along each axis."""
+    return float(np.hypot(way[0], way[1])) > SHOWN * sigma
 
 
 def launch_velocity(track: Track) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
-from ballfg.estimation.launcher import FIRST_SAMPLES, SpinLabel, group_spin, undirected_spin
+from ballfg.estimation.launcher import FIRST_SAMPLES, SpinLabel, group_spin, shows_direction, undirected_spin
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
@@ -45,8 +45,6 @@ from ballfg.vision.camera import Camera
 
 LAG = 128
 """States that stay when the window is cut: 0.7 s at 180 Hz; new samples carry no information on older ones."""
-SHOWN: Final = 20.0
-"""Horizontal way of a ball, in standard deviations of a position, from which on its direction is known to 4 degrees."""
 EARLIER: Final[Mapping[str, Solver]] = {"isam2": "gtsam", "chain": "ballfg"}
 """Earlier names of solvers as an argument of `Online`."""
 
@@ -314,11 +312,9 @@ class Online(Estimator):
     def _launch_shows(self) -> bool:
         """Whether the direction of the launch is known for the first time, or is final with this sample."""
         first, last = self._samples[0], self._samples[-1]
-        if len(self._samples) >= FIRST_SAMPLES:
-            self._undirected = None
-            return True
-        way, spread = (last.position - first.position)[:2], max(first.sigma[:2].max(), last.sigma[:2].max())
-        return first.label is self._undirected and float(np.hypot(*way)) > SHOWN * float(spread)
+        sigma = float(np.maximum(first.sigma, last.sigma)[:2].max())
+        known = first.label is self._undirected and shows_direction(last.position - first.position, sigma)
+        return known or len(self._samples) == FIRST_SAMPLES
 
     def _append(self, window: StreamWindow, *samples: Sample) -> Update:
         update = window.append_all(samples)
