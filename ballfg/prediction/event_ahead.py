@@ -115,8 +115,8 @@ def _other_contact(
         before[0, :STATE_DIM] = torch.from_numpy(found.state)
         other = next_contact(*carried, horizon + LATER, after=found.time)
     else:
-        before[0, VZ] *= -1.0
-        before[0, VZ] *= float(before[0, VZ] / belief.model.after_bounce(before)[0, VZ]) * -1.0
+        before[0, VZ] *= -1.0  # had it come down as fast as it rises, it would rise more slowly, by the restitution
+        before[0, VZ] = -(before[0, VZ] ** 2) / belief.model.after_bounce(before)[0, VZ]
         other = Crossing(start.time, 0.0, before[0, :STATE_DIM].numpy(), start.covariance)
     jump = float(belief.model.after_bounce(before)[0, VZ] - before[0, VZ])
     return min(variance / jump**2, MOST), other

@@ -25,7 +25,8 @@ NEGLIGIBLE: Final = 1e-6
 LEAST_SAMPLES: Final = 8
 LEAST_TIME: Final = 0.04
 """Samples and s within which the estimator must have found the contact. At 1000 Hz eight samples are over before a ball
-whose surface is known to 4 mm shows on which side it is."""
+whose surface is known to 4 mm shows on which side it is. 2 mm at 1000 Hz chose the time; 1 and 5 mm, and 500 Hz,
+judged it."""
 MOST_REJECTED: Final = 2
 """Number of consecutive samples without a fitting hypothesis after which another event is assumed."""
 GATE_CHANCE: Final = 1e-6
