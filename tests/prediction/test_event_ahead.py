@@ -10,6 +10,7 @@ import torch
 from scipy import stats
 
 from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.dynamics.compiled.beliefs.course import Scattered
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState, Plane, next_contact, plane_crossing
@@ -215,6 +216,30 @@ def test_probabilities_are_the_shares_of_balls_of_the_belief(scene):
         told, share = ahead.event(text).probability, share_through(states, Plane.parse(text))
         low, high = stats.binom.interval(0.999, count, share) if 0.0 < share < 1.0 else (count * share, count * share)
         assert low <= count * told <= high, (text, told, share)
+
+
+@pytest.mark.parametrize("surfaces", [Surfaces(0.0), Surfaces(0.0, -0.76, (-2.0, 0.6, -0.7, 0.7))])
+def test_possible_balls_move_as_every_other_ball_does(world, surfaces):
+    """Fast ones, ones that come to rest in low hops, and ones that fall past the table's end, each without chance."""
+    rng, step, steps = np.random.default_rng(9), 0.08, 12
+    start = FALLING + np.array([0.1] * 3 + [2.0] * 3 + [100.0] * 3) * rng.standard_normal((400, 9))
+    start[::4, 2:6] *= [0.1, 0.1, 0.1, 0.0]
+    start[:, 2] = np.abs(start[:, 2]) + 0.03
+    calm = np.zeros((400, steps, 3)), np.zeros((400, 3)), np.zeros((400, 4))
+    balls = Scattered.of(world.model, start, step, calm, surfaces)
+    times = step * torch.arange(1, steps + 1, dtype=torch.float64)
+    exact = rollout(world.model, torch.from_numpy(start), times, surfaces).numpy()
+    assert balls.times[:, 3::3] == pytest.approx(np.tile(times, (400, 1)))
+    off = np.abs(balls.states[:, 3::3] - exact)
+    assert off[..., :3].max() < 1e-3
+    assert np.quantile(off[..., 3:6].max(axis=(1, 2)), 0.98) < 0.02  # the others bounce right at the end of a step
+    before, left, bounced = balls.states[:, 1::3], balls.states[:, 2::3], np.diff(balls.met[:, ::3], axis=1) == 1
+    assert bounced.sum() > 300
+    bounced &= left[..., VZ] > 0.0  # else at rest by the end of the step
+    impact = world.model.after_bounce(torch.from_numpy(before[bounced])).numpy()
+    assert left[bounced] == pytest.approx(impact, abs=2e-3)
+    if surfaces.floor_height is None:
+        assert balls.states[..., 2].min() > 0.01  # no moment lies below the table
 
 
 @pytest.mark.parametrize("mean", [[0.0, 0.0, 9.0, 3.0, 0.5, 1.0, 0.0, 0.0, 0.0], FALLING])

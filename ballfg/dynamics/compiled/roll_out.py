@@ -1,11 +1,11 @@
 """Moves balls from time to time through contacts and rest in machine code, by the rules of `motion.rollout`."""
 
 import numpy as np
+from numba.extending import register_jitable
 
 from ballfg.dynamics.compiled.beliefs.edges import gap_of, is_slow, level_at, level_below, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import (
-    evaluate,
     fly_together,
     glide,
     law_at,
@@ -17,7 +17,9 @@ from ballfg.dynamics.compiled.flight import (
 )
 from ballfg.dynamics.compiled.ground import advance_step, advance_still
 from ballfg.dynamics.compiled.signatures import (
+    ADDRESS,
     COUNT,
+    COUNTS,
     FLAG,
     FOUR,
     GIVEN,
@@ -29,6 +31,7 @@ from ballfg.dynamics.compiled.signatures import (
     ROLLING,
     THREE,
     TWO,
+    Law,
 )
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED, steps_over
 
@@ -81,12 +84,15 @@ def _push(surface, x, push, h, world):
         x[5] += h * push[2]
 
 
-@machine_code(REAL(ONE, ONE, REAL, REAL))
-def _time_down(x, after, z, h):
-    """Time (s) at which a centre is at a height z (m) on the cubic between two states (9,) h s apart; NaN outside."""
+@machine_code(FLAG(ONE, ONE, REAL, REAL, ONE, ONE))
+def _touches(x, after, z, h, tau, touch):
+    """Whether a centre comes down on a height z (m) on the cubic between two states (9,) h s apart.
+
+    Writes: the time tau (1,) s and the state touch (9,) there.
+    """
     rise, t = after[2] - x[2], 0.5
     if not x[2] > z > after[2]:
-        return np.nan
+        return False
     bend, twist = 3.0 * rise - h * (2.0 * x[5] + after[5]), h * (x[5] + after[5]) - 2.0 * rise
     low, high = 0.0, 1.0
     for _ in range(NEWTON_STEPS):
@@ -99,32 +105,14 @@ def _time_down(x, after, z, h):
             t = 0.5 * (low + high)
         if abs(t - sooner) < TIME_TOLERANCE:
             break
-    return t * h
-
-
-@machine_code(FLAG(LAWS, ONE, ONE, REAL, REAL, REAL, ONE, ONE, TWO))
-def _bounces_once(laws, x, after, level, raised, h, world, times, nodes):
-    """Whether a ball x (9,) that comes down on a level in a step of h s passes it or bounces once and rises.
-
-    Args: raised: m, of the surface above its level.  after (9,): the ball without surfaces; where it is true with them.
-    Writes: after a bounce the states right before and after to nodes, and their time to times.
-    """
-    tau = _time_down(x, after, level + raised + world[2], h)
-    if not 0.0 <= tau <= h:
-        return False
-    touch, left = x.copy(), np.empty(9)
-    glide(laws.rates, touch, tau, 1)
-    if level == world[0] and not over_table(touch, world):
-        return gap_of(laws.surface, after, world[1], world[2]) >= 0.0
-    evaluate(laws.impact, touch, np.empty((9, 0)), left, np.empty((9, 0)))
-    if not left[5] >= REST_SPEED:
-        return False
-    put(nodes[0], touch)
-    put(nodes[1], left)
-    times[0] = times[1] = tau
-    glide(laws.rates, left, h - tau, 1)
-    put(after, left)
-    return after[5] >= 0.0 or gap_of(laws.surface, after, level, world[2]) >= 0.0
+    tau[0] = t * h
+    for i in range(3):
+        rise = after[i] - x[i]
+        bend, twist = 3.0 * rise - h * (2.0 * x[3 + i] + after[3 + i]), h * (x[3 + i] + after[3 + i]) - 2.0 * rise
+        touch[i] = x[i] + t * (h * x[3 + i] + t * (bend + t * twist))
+        touch[3 + i] = x[3 + i] + t * (2.0 * bend + 3.0 * t * twist) / h
+        touch[6 + i] = x[6 + i] + t * (after[6 + i] - x[6 + i])
+    return True
 
 
 @machine_code(COUNT(LAWS, LAW, ONE, REAL, ONE, ONE, ONE, TWO))
@@ -136,10 +124,107 @@ def _bounces(laws, rolling, x, h, world, after, times, nodes):
     if count:
         put(nodes[0], x)
         put(nodes[1], after)
-        times[0], times[1] = at[0], at[count - 1]
+        times[0] = at[0]
         glide(laws.rates, nodes[0], times[0], 1)
-        glide(laws.rates, nodes[1], times[1] - h, 1)
+        if after[5] != 0.0:  # else it came to rest after its last bounce, and did not fly to where it is
+            times[1] = at[count - 1]
+            glide(laws.rates, nodes[1], times[1] - h, 1)
     return count
+
+
+@register_jitable
+def _rows(law, which):
+    """A law of some of its balls, which (n,), without tangents."""
+    n, p = len(which), law.c.shape[1]
+    c = np.empty((n, p))
+    for i in range(n):
+        put(c[i], law.c[which[i]])
+    return Law(law.compute, c, np.empty((n, p, 0)), law.w)
+
+
+@machine_code(NOTHING(ADDRESS, LAWS, COUNTS, TWO, ONE, TWO, TWO))
+def _leave(rates, laws, which, touch, rest, left, after):
+    """Balls in rows which (n,) bounce at states touch (n, 9) and fly on for rest (n,) s.
+
+    Writes: left (n, 9), the states right after the bounce; after (n, 9), those at the end.
+    """
+    n, calm = len(which), np.empty((len(which), 9, 0))
+    impact, flying = _rows(laws.impact, which), _rows(laws.rates, which)
+    impact.compute(touch, impact.c, impact.w, calm, impact.ct, left, calm)
+    put_all(after, left)
+    fly_together(rates, after, calm, flying.c, flying.ct, flying.w, rest, np.zeros((n, 0)), 1)
+
+
+@machine_code(FLAG(LAW, ONE, ONE, REAL, ONE))
+def _stays_above(surface, left, after, level, world):
+    """Whether a ball that left (9,) a level rises, and is above it at the end (9,) of the step."""
+    return left[5] >= REST_SPEED and (after[5] >= 0.0 or gap_of(surface, after, level, world[2]) >= 0.0)
+
+
+@machine_code(COUNT(LAWS, TWO, TWO, REAL, TWO, COUNTS, ONE, TWO, ONE, COUNTS))
+def _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful):
+    """How many balls x (m, 9) come down on a surface in a step of h s after which they are at after (m, 9).
+
+    Writes: to the first places which, tau and touch, their rows, times (s) and states (9,) there, and the levels (m) of
+        all; doubtful (m,), 1 where a closer look is needed: a ball that may be at rest, or falls to the floor.
+    """
+    m, n, none, unmoved = len(x), 0, np.empty((len(x), 9, 0)), np.empty((len(x), 3, 0))
+    under, raised, surface = np.empty((m, 3)), np.empty((m, 3)), laws.surface
+    surface.compute(x, surface.c, surface.w, none, surface.ct, under, unmoved)
+    surface.compute(after, surface.c, surface.w, none, surface.ct, raised, unmoved)
+    for r in range(m):
+        world, doubtful[r] = worlds[r], int(is_slow(x[r]))
+        level[n] = level_at(x[r, 2] - under[r, 0], world)
+        height = level[n] + raised[r, 0] + world[2]
+        if doubtful[r] or not (after[r, 5] < 0.0 and after[r, 2] < height):
+            continue
+        if not _touches(x[r], after[r], height, h, tau[n:], touch[n]):
+            doubtful[r] = 1
+        elif level[n] == world[0] and not over_table(touch[n], world):
+            doubtful[r] = int(gap_of(only(surface, r), after[r], world[1], world[2]) < 0.0)
+        else:
+            which[n] = r
+            n += 1
+    return n
+
+
+@machine_code(NOTHING(ADDRESS, LAWS, LAW, TWO, TWO, REAL, TWO, TWO, THREE, COUNTS))
+def _bounce(rates, laws, rolling, x, after, h, worlds, times, nodes, bounced):
+    """Moves balls x (m, 9), which would be at after (m, 9) in h s without surfaces, through their bounces.
+
+    Balls that bounce once and rise, nearly all, are moved together; the others one by one, by the rules of rollout.
+    Writes: after; times (m, 3) and nodes (m, 3, 9), as a step of `scatter`; bounced (m,), the numbers of bounces.
+    """
+    m = len(x)
+    which, doubtful = np.empty(m, dtype=np.int64), np.empty(m, dtype=np.int64)
+    tau, touch, level, left, end = np.empty(m), np.empty((m, 9)), np.empty(m), np.empty((m, 9)), np.empty((m, 9))
+    n = _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful)
+    if n:
+        _leave(rates, laws, which[:n], touch[:n], h - tau[:n], left[:n], end[:n])
+    for i in range(n):
+        r = which[i]
+        if not _stays_above(only(laws.surface, r), left[i], end[i], level[i], worlds[r]):
+            doubtful[r] = 1
+            continue
+        bounced[r] = 1
+        put(after[r], end[i])
+        put(nodes[r, 0], touch[i])
+        put(nodes[r, 1], left[i])
+        times[r, 0] = times[r, 1] = tau[i]
+    for r in range(m):
+        if doubtful[r]:
+            bounced[r] = _bounces(
+                laws_of_one(laws, r), only(rolling, r), x[r], h, worlds[r], after[r], times[r], nodes[r]
+            )
+
+
+@machine_code(NOTHING(ONE, REAL, ONE, ONE))
+def _kick(kick, rest, left, after):
+    """Changes the velocity of a ball that left (9,) a surface, rest s before it is at after (9,), by kick (3,) m/s."""
+    for i in range(3):
+        left[3 + i] += kick[i]
+        after[i] += kick[i] * rest
+        after[3 + i] += kick[i]
 
 
 @machine_code(NOTHING(*GIVEN, *ROLLING, TWO, REAL, THREE, TWO, TWO, FOUR, THREE, THREE))
@@ -157,40 +242,23 @@ def scatter(
     """
     m, k = len(start), pushes.shape[1]
     all_laws, grounded = laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws), law_at(rolling, g, gt, wg)
-    x, after, none, calm = start.copy(), np.empty((m, 9)), np.empty((m, 9, 0)), np.zeros((m, 0))
-    under, raised, unmoved, step = np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3, 0)), np.full(m, h)
+    x, after, bounced = start.copy(), np.empty((m, 9)), np.empty(m, dtype=np.int64)
+    none, calm, step, so_far = np.empty((m, 9, 0)), np.zeros((m, 0)), np.full(m, h), np.zeros(m, dtype=np.int64)
+    until, at = np.empty((m, 3)), np.empty((m, 3, 9))
     for j in range(k):
         for r in range(m):
             _push(only(all_laws.surface, r), x[r], pushes[r, j], 0.5 * h, worlds[r])
         put_all(after, x)
         fly_together(rates, after, none, c, ct, w, step, calm, 1)
-        all_laws.surface.compute(x, s, ws, none, st, under, unmoved)
-        all_laws.surface.compute(after, s, ws, none, st, raised, unmoved)
+        until[:], bounced[:] = h, 0
+        _bounce(rates, all_laws, grounded, x, after, h, worlds, until, at, bounced)
         for r in range(m):
-            world, before, bounced = worlds[r], 0.0 if j == 0 else met[r, j - 1, 2], 0
-            level = level_at(x[r, 2] - under[r, 0], world)
-            slow, below = is_slow(x[r]), after[r, 5] < 0.0 and after[r, 2] - level - raised[r, 0] - world[2] < 0.0
-            times[r, j] = h
-            if slow or below:
-                laws = laws_of_one(all_laws, r)
-                if not slow and _bounces_once(
-                    laws, x[r], after[r], level, raised[r, 0], h, world, times[r, j], nodes[r, j]
-                ):
-                    bounced = int(times[r, j, 0] < h)
-                else:
-                    times[r, j] = h
-                    bounced = _bounces(laws, only(grounded, r), x[r], h, world, after[r], times[r, j], nodes[r, j])
-            if bounced:
-                for i in range(3):
-                    kick = kicks[(r + int(before)) % m, i]
-                    nodes[r, j, 1, 3 + i] += kick
-                    after[r, i] += kick * (h - times[r, j, 1])
-                    after[r, 3 + i] += kick
-            _push(only(all_laws.surface, r), after[r], pushes[r, j], 0.5 * h, world)
-            put(nodes[r, j, 2], after[r])
-            if not bounced:
-                put(nodes[r, j, 0], after[r])
-                put(nodes[r, j, 1], after[r])
-            met[r, j, 0], met[r, j, 1], met[r, j, 2] = before, before + bounced, before + bounced
-            times[r, j] += j * h
+            if bounced[r]:
+                _kick(kicks[(r + so_far[r]) % m], h - until[r, 1], at[r, 1], after[r])
+            _push(only(all_laws.surface, r), after[r], pushes[r, j], 0.5 * h, worlds[r])
+            for i in range(3):
+                put(nodes[r, j, i], at[r, i] if bounced[r] and i < 2 else after[r])
+                met[r, j, i] = so_far[r] + (bounced[r] if i else 0)
+                times[r, j, i] = j * h + until[r, i]
+            so_far[r] += bounced[r]
         put_all(x, after)
