@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Rows, Values
 from ballfg.factors.linear.covariance import Covariances, marginal_covariances
 from ballfg.factors.linear.step import Step, solve
@@ -82,9 +83,6 @@ class Minimum:
 AT_KINK = 1e-3
 """Posterior standard deviations. A step this short that does not reduce the objective ends the search too: the minimum
 lies at a kink of a loss or of the friction, or rounding hides it. At the iteration limit it is the minimum, too."""
-NEAR = 0.5
-"""Predicted decrease of a step of one posterior standard deviation. Along shorter steps the objective is close enough
-to a parabola for choosing the best share of the step."""
 WHOLE = 0.5
 """A step with more than this share of its predicted decrease is as good as the linear model allows."""
 SHORT = 1.5
@@ -95,6 +93,10 @@ RATE_MARGIN = 10.0
 """Factor by which the convergence may slow down, for the last step to be left out all the same."""
 LONGEST = 10.0
 """Largest multiple of a whole step, for a step that is too short."""
+SHARES = 5
+"""Largest number of shares of a step that are tried."""
+SMALLER = 0.1, 0.6
+"""Least and largest share, as a share of the one before."""
 MOST_DAMPING = 1e8
 """Marquardt's lambda at which a step is negligible."""
 
@@ -178,6 +180,15 @@ class _Point:
         self.values, self.linearized, self.error = values, linearized, objective(linearized)
         self.beyond = False
 
+    def cost(self) -> float:
+        """The objective."""
+        return self.error
+
+    def moved(self, graph: BallGraph, states: Array, coefficients: Array) -> "_Point":
+        """The point after a step, linearised."""
+        values = self.values.retract(states, coefficients)
+        return _Point(values, graph.linearize(values))
+
     def retract(self, step: Step) -> "_Point":
         """The point after a step without a linearisation, with the predicted objective."""
         after = copy.copy(self)
@@ -204,18 +215,49 @@ def _gain(before: _Point, after: _Point, step: Step) -> float:
 
 
 def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Point:
-    """The point after a step, or after a multiple of it if an undamped one gained far less or more than predicted.
-
-    If the objective bends r times as much along the step as the linear model says (friction between slip and grip
-    does), the whole step gains (2 - r) of its prediction and 1 / r of it is best. Whole steps then creep or diverge.
-    """
-    values = point.values.retract(step.states, step.coefficients)
-    whole = _Point(values, graph.linearize(values))
+    """The point after a step, or near it if an undamped one gained far less or more than predicted."""
+    whole = point.moved(graph, step.states, step.coefficients)
     gain = _gain(point, whole, step)
-    tells = gain <= WHOLE or (gain >= SHORT and step.decrease > ROUNDING * point.error)
-    if damping > 0.0 or not tells or step.decrease > NEAR or not np.isfinite(whole.error):
+    if damping > 0.0 or step.decrease <= ROUNDING * point.error or not np.isfinite(whole.error):
         return whole
-    share = 1.0 / max(2.0 - gain, 1.0 / LONGEST)
-    values = point.values.retract(share * step.states, share * step.coefficients)
-    nearer = _Point(values, graph.linearize(values))
-    return nearer if nearer.error < min(point.error, whole.error) else whole
+    if gain <= WHOLE:
+        return _bent(graph, point, step, whole)
+    if gain >= SHORT:  # of a parabola that bends (2 - gain) times as much
+        longer = min(1.0 / max(2.0 - gain, np.finfo(float).tiny), LONGEST)
+        return min(whole, point.moved(graph, longer * step.states, longer * step.coefficients), key=_Point.cost)
+    return whole
+
+
+def _bent(graph: BallGraph, point: _Point, step: Step, whole: _Point) -> _Point:
+    """The lowest point near a path that leaves along a step and bends as the residuals do, for shorter ones by and by.
+
+    The objective is a narrow valley where tight residuals are not linear: the place of a bounce is a product of time
+    and velocity. A straight step leaves the valley, and Marquardt's damping, which holds each unknown by itself, leaves
+    only small ones. What the linear model missed after a share of the step is therefore taken back by a second step.
+    Source: M. K. Transtrum, J. P. Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear
+        least-squares minimization", 2012 (geodesic acceleration, with the error itself for its second derivative).
+    """
+    share, straight, best = 1.0, whole, whole
+    for _ in range(SHARES):
+        enough = point.error - WHOLE * share * (2.0 - share) * step.decrease
+        if straight.error > enough and np.isfinite(straight.error):
+            best = min(best, _taken_back(graph, point, step, share, straight), key=_Point.cost)
+        if best.error < enough:
+            break
+        share *= min(max(share / (2.0 * share - _gain(point, straight, step)), SMALLER[0]), SMALLER[1])
+        straight = point.moved(graph, share * step.states, share * step.coefficients)
+        best = min(best, straight, key=_Point.cost)
+    return best
+
+
+def _taken_back(graph: BallGraph, point: _Point, step: Step, share: float, there: _Point) -> _Point:
+    """The point after a share of a step, and a second step for what the linear model missed on the way `there`."""
+    missed = [
+        replace(old, residual=new.residual - share * step.change_of(old))
+        for old, new in zip(point.linearized, there.linearized, strict=True)
+    ]
+    back = solve(missed, point.values)
+    if back is None:
+        return there
+    rest = share - 1.0  # the solution makes the whole step as well
+    return point.moved(graph, back.states + rest * step.states, back.coefficients + rest * step.coefficients)

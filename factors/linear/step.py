@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.arrays import Array, Index, plain
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, REAL, THREE, TWO
-from ballfg.factors.batch import Rows, Values
+from ballfg.factors.batch import COEFFICIENTS, Rows, Values
 from ballfg.factors.linear import elimination
 from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.substitution import solution_of
@@ -53,6 +53,16 @@ class Step:
             held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()
             promised += damping * float(held)
         return cls(states, coefficients, root, 0.5 * promised)
+
+    def change_of(self, rows: Rows) -> Array:
+        """(m, r) J d, by which the linear model changes the residuals of some factors."""
+        moved = np.zeros_like(rows.residual)
+        for variables, jacobian in zip(rows.variables.T, rows.jacobians, strict=True):
+            if len(variables) and variables[0] == COEFFICIENTS:
+                moved += jacobian @ self.coefficients
+            else:
+                moved += (jacobian @ self.states[variables, : jacobian.shape[2], None])[..., 0]
+        return moved
 
 
 def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:

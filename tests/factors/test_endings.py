@@ -92,3 +92,31 @@ def test_steps_that_are_too_long_or_too_short_do_not_creep(bend: float) -> None:
     assert minimum.convergence is Convergence.CONVERGED
     assert minimum.iterations <= 12
     assert abs(minimum.values.states[0, 0]) < 1e-4
+
+
+class Valley(FactorBatch):
+    """Rosenbrock's valley along y = x^2 of the first two numbers of a state v (9,), with a minimum at (1, 1)."""
+
+    def __init__(self, steepness: float) -> None:
+        super().__init__(np.array([[0]]), 9)
+        self.steepness = steepness
+
+    def compute(self, rows, inputs):
+        (state,) = inputs
+        x, y, residual = state[:, 0], state[:, 1], state.copy()
+        residual[:, 0], residual[:, 1] = 1.0 - x, self.steepness * (y - x**2)
+        jacobian = np.zeros((len(x), 9, 9))
+        jacobian[:, np.arange(2, 9), np.arange(2, 9)] = 1.0
+        jacobian[:, 0, 0] = -1.0
+        jacobian[:, 1, 0], jacobian[:, 1, 1] = -2.0 * self.steepness * x, self.steepness
+        return residual, (jacobian,)
+
+
+@pytest.mark.parametrize("steepness", [10.0, 1e3, 1e5])
+def test_a_step_bends_along_a_narrow_valley(steepness: float) -> None:
+    """However narrow it is: a straight step would have to be the shorter, the steeper the sides are."""
+    start = np.zeros((1, 9))
+    start[0, :2] = -1.2, 1.44
+    minimum = LevenbergMarquardt(max_iterations=5).minimize(BallGraph((Valley(steepness),)), Values(start, np.zeros(0)))
+    assert minimum.convergence is Convergence.CONVERGED
+    assert minimum.values.states[0, :2] == pytest.approx([1.0, 1.0], abs=1e-6)
