@@ -18,7 +18,7 @@ from ballfg.tracks.track import Label
 
 _DISORDER: Final = 3.0  # median steps: an earlier stamp within this came late; beyond it a new shot begins
 _LARGEST: Final = 1e15  # in the source's units; a larger number is not a position in any unit, and counts as missing
-_ALONE: Final = 5.0  # median steps from its neighbours at which a row of zeros is a missing sample
+_ALONE: Final = 5.0  # median steps from a neighbour at which a row with x = y = z is a mark of a missing sample
 GAP: Final = 0.5  # s without samples after which a new shot begins
 GAP_STEPS: Final = 20.0  # least number of median steps in such a gap
 
@@ -41,7 +41,7 @@ class Counts:
     """Counts of omitted or reordered rows."""
 
     missing: int = 0
-    zeros: int = 0
+    marks: int = 0
     late: int = 0
     short: int = 0
     ignored: set[str] = field(default_factory=set)
@@ -51,7 +51,7 @@ class Counts:
         """One sentence for each kind."""
         said = {
             f"{self.missing} rows without a time or a position left out": self.missing,
-            f"{self.zeros} rows with x = y = z = 0 far from their neighbours left out as missing samples": self.zeros,
+            f"{self.marks} rows with x = y = z far from their neighbours left out as missing samples": self.marks,
             f"{self.late} rows put in the order of their times": self.late,
             f"{self.short} shots of fewer than two samples left out": self.short,
             f"columns left out: {', '.join(sorted(self.ignored))}": self.ignored,
@@ -92,7 +92,7 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
     found = []
     labels = _labels(table, roles.others, parts, counts)
     for i, (name, part) in enumerate(zip(names, parts, strict=True)):
-        part = part[~_lone_zeros(positions[part], counts)]
+        part = part[~_marks(positions[part], counts)]
         if len(part) < 2:
             counts.short += 1
             continue
@@ -185,16 +185,19 @@ def _by_name(
     return [_ordered(part, stamps, counts) for part in parts], names
 
 
-def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
-    """Rows of zeros, written by trackers that did not see the ball."""
-    zero = (positions == 0.0).all(axis=1)
-    if not zero.any() or zero.all():
-        return np.zeros(len(zero), dtype=bool)
-    held = positions[~zero]
-    typical = float(np.median(np.linalg.norm(np.diff(held, axis=0), axis=1))) if len(held) > 2 else 0.0
-    lone = zero & (np.linalg.norm(held, axis=1).min() > _ALONE * typical)
-    counts.zeros += int(lone.sum())
-    return np.asarray(lone)
+def _marks(positions: Array, counts: Counts) -> NDArray[np.bool_]:
+    """Rows of one number, such as 0 or -9999, that trackers write where they did not see the ball."""
+    alike = np.ptp(positions, axis=1) == 0.0
+    seen = np.flatnonzero(~alike)
+    if not alike.any() or not len(seen):
+        return np.zeros(len(alike), dtype=bool)
+    typical = float(np.median(np.linalg.norm(np.diff(positions[seen], axis=0), axis=1))) if len(seen) > 2 else 0.0
+    after = np.searchsorted(seen, np.arange(len(alike)))  # index into the seen rows
+    neighbours = (seen[np.maximum(after - 1, 0)], seen[np.minimum(after, len(seen) - 1)])
+    off = np.max([np.linalg.norm(positions - positions[rows], axis=1) for rows in neighbours], axis=0)
+    marks = alike & (off > _ALONE * typical)
+    counts.marks += int(marks.sum())
+    return np.asarray(marks)
 
 
 def _labels(

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ballfg as bf
 from ballfg.importing.formats.sources import tables_of
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track, read_dataset
 from tests.commands import status
 from tests.importing.test_forms import Y_UP, same_shots
+from tests.importing.throws import thrown
 
 Rows = list[list[str]]
 Columns = dict[str, np.ndarray]
@@ -236,6 +238,19 @@ def test_imported(mistake: Mistake, shots: list[Track], tmp_path: Path) -> None:
 def _without(track: Track, found: Track) -> Track:
     """The samples of a track whose stamps were imported."""
     return Track(*(values[np.isin(track.times, found.times)] for values in (track.times, track.positions)))
+
+
+@pytest.mark.parametrize("mark", [0.0, -1.0, -9999.0])
+def test_a_mark_in_all_coordinates_is_no_position(mark: float) -> None:
+    """The ball begins 0.2 m from the origin, where a row of zeros is near to some samples but not to its neighbours."""
+    t, p = thrown(0.001)
+    p -= [0.2, 0.0, p[0, 2]]
+    marked = p.copy()
+    marked[[33, 34, 50, len(t) - 1]] = mark
+    (track,) = bf.import_tracks(np.column_stack((t, marked)), up="z", length="m", time="s")
+    seen = (marked == p).all(axis=1)
+    np.testing.assert_array_equal(track.times, t[seen])
+    np.testing.assert_array_equal(track.positions, p[seen])
 
 
 def test_rows_from_last_to_first(shots: list[Track], tmp_path: Path) -> None:
