@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.dynamics import nominal_model
 from ballfg.importing.choices import Choices, Guess
 from ballfg.importing.frame import Frame
 from ballfg.tracks import TABLE_TENNIS, Ball, Track
@@ -25,6 +26,7 @@ _ODD: Final = 0.1  # share of the turns near a surface's height that are none of
 _LEVEL: Final = np.array([0.003, 0.006, 0.012])[:, None]  # m, standard deviations of the heights of its bounces
 _UNEVEN: Final = np.array([0.01, 0.02, 0.04])[:, None]  # m, of those of hits that are near each other
 _MOST_SWERVE: Final = 0.6  # friction changes the horizontal velocity by less than this share of the vertical change
+_ROUGH: Final = 2.0  # standard deviations by which a court's friction may exceed that of the ball's model
 _MOST_GAIN: Final = 0.2  # likewise of its growth, by topspin: at most 0.18 on five measured sets
 _FEW: Final = 10  # number of bounces that shows a surface beside hits at other heights
 _FEW_SHARE: Final = 0.5  # least share of all turns that fewer bounces are
@@ -55,21 +57,24 @@ class Turn:
     restitution: float  # vertical speed after over that before
     swerve: float  # change of the horizontal velocity over that of the vertical one
     gain: float = 0.0  # likewise of its component forwards
+    most_swerve: float = _MOST_SWERVE  # by a surface
 
     @property
     def bounce(self) -> bool:
         """True if something level and at rest can do it."""
         low, high = _RESTITUTION[0] - _SPREAD, _RESTITUTION[-1] + _SPREAD
-        return bool(low <= self.restitution <= high and self.swerve <= _MOST_SWERVE and self.gain <= _MOST_GAIN)
+        return bool(low <= self.restitution <= high and self.swerve <= self.most_swerve and self.gain <= _MOST_GAIN)
 
 
-def surface(shots: Iterable[tuple[Array, Array]], handled: bool = False) -> Surface | None:
+def surface(
+    shots: Iterable[tuple[Array, Array]], handled: bool = False, most_swerve: float = _MOST_SWERVE
+) -> Surface | None:
     """The surface of most bounces, or a higher one with nearly as many; of times (n,) s and positions (n, 3) m.
 
-    Args: handled: True if hands or rackets also move the ball.
+    Args: handled: True if hands or rackets also move the ball.  most_swerve: of a bounce, dimensionless.
     """
     shots = list(shots)
-    turns = [turn for t, p in shots for turn in turns_of(t, p)]
+    turns = [turn for t, p in shots for turn in turns_of(t, p, most_swerve)]
     odd = sum(not turn.bounce for turn in turns) > _ODD * len(turns)
     prior = 0.0 if handled or odd or any(reverses(t, p) for t, p in shots) else _UNHANDLED
     left = sorted(turns, key=lambda turn: turn.height)
@@ -121,9 +126,11 @@ def _log_mean(logs: Array) -> float:
 
 def reverses(times: Array, positions: Array) -> bool:
     """True if the horizontal motion of a ball turns back, as at a wall or a racket; of (n,) s and (n, 3) m."""
+    # medians of three in a row, so that an outlier turns nothing
+    times, places = times[1:-1], np.median([positions[:-2, :2], positions[1:-1, :2], positions[2:, :2]], axis=0)
     ahead = np.searchsorted(times, times + _ARM)
     ahead = ahead[ahead < len(times)]
-    way = (positions[ahead, :2] - positions[: len(ahead), :2]) / _ARM
+    way = (places[ahead] - places[: len(ahead)]) / _ARM
     before, after = way[: int((ahead < len(way)).sum())], way[ahead[ahead < len(way)]]
     fast = np.minimum(np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)) > _REVERSED
     return bool((fast & ((before * after).sum(axis=1) < 0.0)).any())
@@ -134,7 +141,15 @@ def _scatter(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def turns_of(times: Array, positions: Array) -> list[Turn]:
+def most_swerve_of(ball: Ball) -> float:
+    """Largest change of the horizontal velocity over that of the vertical one, in a bounce: no more than friction."""
+    model = nominal_model(ball)
+    name = "bounce.friction.mu"
+    friction = float(dict(model.named_parameters())[name].detach())
+    return max(_MOST_SWERVE, friction + _ROUGH * model.declared_coefficients()[name].sigma)
+
+
+def turns_of(times: Array, positions: Array, most_swerve: float = _MOST_SWERVE) -> list[Turn]:
     """The turns of a ball, where arcs before and after meet; of times (n,) s and positions (n, 3) m."""
     found: list[tuple[float, float, Turn]] = []
     heights = positions[:, 2]
@@ -159,7 +174,7 @@ def turns_of(times: Array, positions: Array) -> list[Turn]:
             along = [np.polyfit(times[part] - times[i], positions[part, :2], 1)[0] for part in arms]
             change = (along[1] - along[0]) / (after[1] - before[1])
             gain = float(change @ along[0]) / max(float(np.linalg.norm(along[0])), 1e-9)
-            turn = Turn(height, (after[1] - _GRAVITY * when) / fall, float(np.linalg.norm(change)), gain)
+            turn = Turn(height, (after[1] - _GRAVITY * when) / fall, float(np.linalg.norm(change)), gain, most_swerve)
             found.append((before[2] + after[2], times[i] + when, turn))
     kept: list[tuple[float, float, Turn]] = []
     for one in sorted(found, key=lambda one: one[:2]):  # the best-fitting of turns less than an arm apart
@@ -204,7 +219,7 @@ def table_of(
         height = choices.table_height
         return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}"), []
     handled = len(flights) != len(tracks) or any(a is not b for a, b in zip(flights, tracks, strict=True))
-    found = surface(((track.seconds, track.positions) for track in flights), handled)
+    found = surface(((track.seconds, track.positions) for track in flights), handled, most_swerve_of(ball))
     if found is None:
         return None, *_without(flights, ball)
     height = round(found.centre - ball.radius, 4)
@@ -217,7 +232,8 @@ def table_of(
 
 def _without(flights: Sequence[Track], ball: Ball) -> tuple[Guess, list[str]]:
     """The guess that there is no surface, and a doubt if some turns of the balls may be bounces."""
-    turns = [turn for flight in flights for turn in turns_of(flight.seconds, flight.positions)]
+    most = most_swerve_of(ball)
+    turns = [turn for flight in flights for turn in turns_of(flight.seconds, flight.positions, most)]
     heights = [turn.height - ball.radius for turn in turns if turn.bounce]
     if not heights:
         return Guess("table height", NO_SURFACE, "no ball bounces", "likely", "--table-height 0.76"), []

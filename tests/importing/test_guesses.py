@@ -71,6 +71,28 @@ def test_walls_and_rackets_reverse_a_motion() -> None:
     back[t > 0.5, 0] = 2.0 * p[np.searchsorted(t, 0.5), 0] - p[t > 0.5, 0]
     assert not reverses(t, p)
     assert reverses(t, back)
+    astray = p.copy()
+    astray[30, 0] += 0.8  # a wrong sample is no wall
+    assert not reverses(t, astray)
+
+
+def _sliding_tennis(friction: float, seed: int) -> np.ndarray:
+    """(n, 4) t, x, y, z of a ball, s and m, that slides over a hard court as it bounces at a height of 33.5 mm."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 0.8, 0.01) + rng.uniform(0.0, 0.01)
+    down, speed = rng.uniform(5.0, 7.0), rng.uniform(18.0, 25.0)
+    e = 0.75 + rng.normal(0.0, 0.03)
+    after = np.maximum(t - 0.4, 0.0)
+    x = speed * t - friction * (1.0 + e) * down * after
+    z = np.where(t < 0.4, (down - 9.81 * 0.4) * (0.4 - t) + 4.905 * (0.16 - t**2), e * down * after - 4.905 * after**2)
+    return np.column_stack((t, np.stack((x, 0.1 * t, z + 0.0335), axis=1) + rng.normal(0.0, 0.003, (len(t), 3))))
+
+
+def test_a_court_as_rough_as_its_ball_is_known_for_is_a_surface() -> None:
+    """The ITF rates hard courts up to 0.73; a table is never so rough, and what takes so much is a racket."""
+    shots = [_sliding_tennis(friction, seed) for seed, friction in enumerate(np.linspace(0.57, 0.73, 12))]
+    assert bf.import_tracks(shots, ball="tennis").info.table_height == pytest.approx(0.0, abs=0.003)
+    assert bf.import_tracks(shots).info.table_height is None
 
 
 @pytest.mark.parametrize(
