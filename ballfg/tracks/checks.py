@@ -235,8 +235,9 @@ def _other_surface(
 ) -> tuple[str, ...]:
     z = positions[:, Z]
     inner = np.arange(reach, len(z) - reach)
-    fall = (z[inner] - z[inner - reach]) / (times[inner] - times[inner - reach])
-    rise = (z[inner + reach] - z[inner]) / (times[inner + reach] - times[inner])
+    last, first = inner - (reach > 1), inner + (reach > 1)  # without the lowest sample itself, which may be an outlier
+    fall = (z[last] - z[inner - reach]) / (times[last] - times[inner - reach])
+    rise = (z[inner + reach] - z[first]) / (times[inner + reach] - times[first])
     lowest = z[inner] == sliding_window_view(z, 2 * reach + 1).min(axis=1)
     bounces = z[inner[lowest & (fall < -LEAST_REVERSAL) & (rise > LEAST_REVERSAL)]] - radius
     gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1, initial=np.inf)

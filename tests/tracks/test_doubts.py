@@ -45,3 +45,10 @@ def test_a_ball_that_lies_and_is_lifted_has_not_bounced(way):
     height = 0.5 + 3.0 * np.maximum(way * (times - 0.2), 0.0)
     positions = np.stack([0.5 * times, np.zeros_like(times), height], axis=-1)
     assert doubts_about(times, positions, (0.0,), RADIUS) == ()
+
+
+@pytest.mark.parametrize("end", [0.6, 0.29], ids=["beside a bounce", "alone"])
+def test_low_samples_are_no_bounces(end):
+    times, positions = bouncing(0.3, end)
+    positions[[12, 25], 2] -= 0.25
+    assert doubts_about(times, positions, (0.0,), RADIUS) == ()
