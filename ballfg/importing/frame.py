@@ -9,6 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.fall import AXES, LENGTHS, TIMES, Scale, Shot, odds, scales
+from ballfg.tracks.track import SPIN_LABELS, Label
 
 _LIKELY: Final = 2.0  # least odds of the best reading against the next
 _SURE: Final = 4.0
@@ -54,6 +55,14 @@ class Frame:
         """(n, 3) in the frame with z up."""
         signs = np.array([-1.0 if axis == self.flip else 1.0 for axis in "xyz"])
         return (positions * signs) @ np.array(TURNS[self.up], dtype=np.float64).T + 0.0
+
+    def turned_spin(self, labels: Mapping[str, Label]) -> Mapping[str, Label]:
+        """The labels of a shot with its spin in the frame with z up; of a mirrored frame it turns the other way."""
+        spin = [labels.get(name) for name in SPIN_LABELS]
+        if not all(isinstance(one, int | float) for one in spin):
+            return labels
+        (turned,) = self.turned(np.array([spin], dtype=np.float64)) * (1.0 if self.flip is None else -1.0) + 0.0
+        return {**labels, **dict(zip(SPIN_LABELS, turned.tolist(), strict=True))}
 
     @property
     def rotation(self) -> str:

@@ -229,8 +229,10 @@ def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], lis
             what = f"{str(error).rpartition('. ')[0]}; a column may tell two balls apart"
             raise UndecidedError(what, "columns", (), "trajectory=NAME") from None
         sigmas = values[:, 4:] if values.shape[1] > 4 else None
-        tracks.append(Track(values[:, 0], values[:, 1:4], sigmas, shot.labels, name=shot.name))
+        tracks.append(Track(values[:, 0], values[:, 1:4], sigmas, frame.turned_spin(shot.labels), name=shot.name))
     notes = findings.notes()
+    if any(track.labels != shot.labels for track, shot in zip(tracks, shots, strict=True)):
+        notes.append(f"spin labels turned with the axes: {frame.rotation}")
     if origin:
         notes.append(f"times count from the stamp {origin} {frame.time}")
     return tracks, notes

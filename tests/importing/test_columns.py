@@ -33,6 +33,24 @@ def test_sigmas_turn_with_the_axes_and_have_the_unit_of_the_positions(tmp_path: 
     assert proposal.info.imported["column sigmas"].startswith("sigma_x, sigma_y, sigma_z (sure")
 
 
+@pytest.mark.parametrize("flip", [None, "x", "y", "z"])
+def test_a_spin_label_turns_with_the_axes(flip: str | None) -> None:
+    """The Magnus force, spin x velocity, is the same force before and after the turn, in a mirrored frame too."""
+    t, p = thrown()
+    spin = np.array([10.0, -200.0, 30.0])  # in the frame with z up
+    force = np.cross(spin, [5.0, 0.3, 1.0])
+    seen = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x, up, -y
+    if flip is not None:
+        seen["xyz".index(flip)] *= -1.0
+    there = np.linalg.det(seen) * seen @ spin
+    np.testing.assert_allclose(np.cross(there, seen @ [5.0, 0.3, 1.0]), seen @ force, atol=1e-12)
+    columns = dict(zip(("t", "x", "y", "z"), np.column_stack((t, p @ seen.T)).T, strict=True))
+    labels = {f"spin_{axis}": np.full(len(t), value) for axis, value in zip("xyz", there, strict=True)}
+    (track,) = bf.import_tracks({**columns, **labels}, flip=flip)
+    np.testing.assert_allclose(track.positions, p, atol=1e-12)
+    np.testing.assert_allclose(track.spin_label, spin, atol=1e-12)
+
+
 @pytest.mark.parametrize("bad", ["0", "-2", "", "1e16"])
 def test_a_sample_whose_sigma_is_none_is_missing(tmp_path: Path, bad: str) -> None:
     t, p = thrown()
