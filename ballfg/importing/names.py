@@ -38,6 +38,7 @@ _NOT_A_POSITION: Final = frozenset((
 ))  # fmt: skip
 IDENTITIES: Final = ("ball", "object", "marker", "body", "player", "id", "name", "label", "target")
 """Names of columns that tell several balls apart."""
+_SEEN: Final = frozenset(("valid", "visible", "tracked", "detected", "seen", "visibility", "validity"))
 _SIGMA: Final = frozenset(("sigma", "std", "stddev", "stdev", "sd", "err", "error", "uncertainty", "unc"))
 _FILLER: Final = frozenset((
     "pos", "position", "positions", "ball", "center", "centre", "coord", "coords", "coordinate", "p", "point", "loc",
@@ -83,6 +84,12 @@ def meanings(name: str) -> list[Meaning]:
     found = [_as_time(words, unit_text), _as_place(words, unit_text), _as_trajectory(words)]
     known = [meaning for meaning in found if meaning is not None]
     return [replace(one, rank=one.rank + 1, group=f"{one.group}#{copy}") for one in known] if copy else known
+
+
+def says_seen(name: str) -> bool:
+    """True of a column that tells whether the ball was seen, such as `is_valid` or `ball visible`."""
+    words = set(words_of(name)) - {"is", "ball", "was"}
+    return len(words) == 1 and words <= _SEEN
 
 
 def _as_time(words: list[str], bracket: str | None) -> Meaning | None:

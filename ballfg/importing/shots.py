@@ -13,12 +13,15 @@ from ballfg.checks import MAX_TEXT, NAME_RULE, is_name, listed, short_text, show
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
+from ballfg.importing.names import says_seen
 from ballfg.importing.stamps import Stamps, as_stamps, joined, missing
 from ballfg.tracks.track import Label
 
 _DISORDER: Final = 3.0  # median steps: an earlier stamp within this came late; beyond it a new shot begins
 _LARGEST: Final = 1e15  # in the source's units; a larger number is not a position in any unit, and counts as missing
 _ALONE: Final = 5.0  # median steps from a neighbour at which a row with x = y = z is a mark of a missing sample
+_YES: Final = ("1", "1.0", "true", "yes")
+_NO: Final = ("0", "0.0", "false", "no")
 GAP: Final = 0.5  # s without samples after which a new shot begins
 GAP_STEPS: Final = 20.0  # least number of median steps in such a gap
 
@@ -41,6 +44,7 @@ class Counts:
     """Counts of omitted or reordered rows."""
 
     missing: int = 0
+    unseen: int = 0
     marks: int = 0
     late: int = 0
     short: int = 0
@@ -51,6 +55,7 @@ class Counts:
         """One sentence for each kind."""
         said = {
             f"{self.missing} rows without a time or a position left out": self.missing,
+            f"{self.unseen} rows whose own column says that the ball was not seen left out": self.unseen,
             f"{self.marks} rows with x = y = z far from their neighbours left out as missing samples": self.marks,
             f"{self.late} rows put in the order of their times": self.late,
             f"{self.short} shots of fewer than two samples left out": self.short,
@@ -75,7 +80,7 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
         sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)
         held &= ((sigmas > 0) & (sigmas <= _LARGEST)).all(axis=1)
     counts.missing += int((~held).sum())
-    rows = np.flatnonzero(held)
+    rows = np.flatnonzero(held & _seen(table, roles.others, held, counts))
     if not len(rows):
         what = f"{table.where}: no row has a time and a position in {', '.join((*roles.time, *roles.places))}"
         raise UndecidedError(what, "columns", (), "t=NAME,x=NAME,y=NAME,z=NAME")
@@ -183,6 +188,21 @@ def _by_name(
         f"{value:.0f}" if is_whole else str(value) or "unnamed" for value, is_whole in zip(values, whole, strict=True)
     ]
     return [_ordered(part, stamps, counts) for part in parts], names
+
+
+def _seen(table: RawTable, names: Iterable[str], held: NDArray[np.bool_], counts: Counts) -> NDArray[np.bool_]:
+    """Rows at which no column such as `valid` is 0 or false; a column without any 1 tells nothing."""
+    seen = np.ones(len(table), dtype=bool)
+    for name in names:
+        column = table.columns.get(name)
+        if column is None or not says_seen(name):
+            continue
+        cells = np.array([str(cell).lower() for cell in column.tolist()])
+        yes, no = np.isin(cells, _YES), np.isin(cells, _NO)
+        if (yes | no).all() and yes.any():
+            seen &= yes
+    counts.unseen += int((held & ~seen).sum())
+    return seen
 
 
 def _marks(positions: Array, counts: Counts) -> NDArray[np.bool_]:

@@ -51,6 +51,23 @@ def test_a_spin_label_turns_with_the_axes(flip: str | None) -> None:
     np.testing.assert_allclose(track.spin_label, spin, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("name", "yes", "no"), [("valid", "1", "0"), ("Ball_Visible", "True", "False"), ("is tracked", "1.0", "0.0")]
+)
+def test_rows_where_a_column_says_that_the_ball_was_not_seen_are_missing(
+    name: str, yes: str, no: str, tmp_path: Path
+) -> None:
+    """A tracker that lost the ball repeats the last position, and says so."""
+    t, p = thrown()
+    seen = np.arange(len(t)) % 20 < 15
+    held = p[np.maximum.accumulate(np.where(seen, np.arange(len(t)), 0))]
+    rows = [[*row, yes if one else no] for row, one in zip(np.column_stack((t, held)).tolist(), seen, strict=True)]
+    proposal = propose(write_rows(tmp_path / "a.csv", f"t,x,y,z,{name}", rows), Choices())
+    np.testing.assert_allclose(proposal.tracks[0].times, t[seen], atol=1e-12)
+    np.testing.assert_allclose(proposal.tracks[0].positions, p[seen], atol=1e-12)
+    assert f"{(~seen).sum()} rows whose own column says that the ball was not seen left out" in proposal.notes
+
+
 @pytest.mark.parametrize("bad", ["0", "-2", "", "1e16"])
 def test_a_sample_whose_sigma_is_none_is_missing(tmp_path: Path, bad: str) -> None:
     t, p = thrown()
