@@ -14,6 +14,7 @@ from ballfg.importing.columns import Roles, roles_of
 from ballfg.importing.fall import TIMES
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.frame import Frame, likely_rate
+from ballfg.importing.names import names_ball
 from ballfg.importing.shots import GAP, GAP_STEPS, Counts, SourceShot, cut, split_at_gaps
 from ballfg.tracks.track import Label
 
@@ -107,21 +108,23 @@ def split(shots: list[SourceShot], roles: Roles, frame: Frame, choices: Choices)
         done = _unique(split_at_gaps(shots, unit, given))
         why = f"cut at gaps of {given:g} s, as given"
         return done, Guess("shots", str(len(done)), why, "stated", f"--split-gap {given:g}")
-    if roles.trajectory is not None:
-        why = f"one for each value of {' and '.join(map(shown, (roles.trajectory, *roles.identities)))}"
-        return shots, Guess("shots", str(count), why, "sure", f"--columns trajectory={roles.trajectory}")
+    named = roles.trajectory is not None
+    told = f"one for each value of {' and '.join(map(shown, filter(None, (roles.trajectory, *roles.identities))))}"
+    stated = "trajectory" in choices.columns
+    if named and (stated or roles.identities or not names_ball(str(roles.trajectory))):
+        return shots, Guess("shots", str(count), told, "sure", f"--columns trajectory={roles.trajectory}")
     steps = [np.diff(shot.stamps).astype(np.float64) * unit for shot in shots]
     typical = float(np.median(np.concatenate(steps)))
     gap = max(GAP, GAP_STEPS * typical)
     interrupted = sum(bool((one > gap).any()) for one in steps)
     typed = f"--split-gap {gap:g}"
     if interrupted < _INTERRUPTED * count:
-        why = "a shot ends where time starts again or the file ends"
+        why = told if named else "a shot ends where time starts again or the file ends"
         if interrupted:
             why += f"; gaps over {gap:g} s in {interrupted} of them are taken for a ball out of sight"
         return shots, Guess("shots", str(count), why, "likely" if interrupted else "sure", typed)
     done = split_at_gaps(shots, unit, gap)
-    if count == 1:
+    if count == 1 and not named:
         done = [replace(shot, name=f"{i:03d}") for i, shot in enumerate(done)]
     held = np.concatenate(steps)
     longest = float(held[held <= gap].max())

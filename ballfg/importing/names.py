@@ -92,6 +92,13 @@ def says_seen(name: str) -> bool:
     return len(words) == 1 and words <= _SEEN
 
 
+def names_ball(name: str) -> bool:
+    """True of a column that tells balls apart, such as `marker` or `id`: a ball may be thrown again and again."""
+    return bool(set(words_of(name)) & set(IDENTITIES)) and not set(words_of(name)) & (
+        set(_TRAJECTORY) - set(IDENTITIES)
+    )
+
+
 def _as_time(words: list[str], bracket: str | None) -> Meaning | None:
     unit = _unit(bracket, TIME_UNITS)
     if not words:

@@ -40,6 +40,25 @@ def test_a_column_of_identities_makes_tracks(column: str, by_time: bool, tmp_pat
     _right(bf.import_tracks(file), list(BALLS))
 
 
+@pytest.mark.parametrize(
+    ("column", "shots"), [("marker", 6), ("ball", 6), ("id", 6), ("shot", 2), ("shot_id", 2), ("track_id", 2)]
+)
+def test_a_ball_that_is_thrown_again_flies_another_shot(column: str, shots: int, tmp_path: Path) -> None:
+    """Two balls, three throws each at 10 s: names of balls do not say where shots end, those of shots do."""
+    t, paths = _paths()
+    rows = [
+        (k, *row)
+        for k, p in enumerate(list(paths.values())[:2])
+        for throw in range(3)
+        for row in np.column_stack((t + 10.0 * throw + 3.0 * k, p)).tolist()
+    ]
+    data = bf.import_tracks(write_rows(tmp_path / "a.csv", f"{column},t,x,y,z", rows))
+    assert len(data) == shots
+    assert max(track.duration for track in data) < (1.0 if shots == 6 else 21.0)
+    assert data.names[0] == ("0-000" if shots == 6 else "0")
+    assert len(bf.import_tracks(tmp_path / "a.csv", columns={"trajectory": column})) == 2
+
+
 @pytest.mark.parametrize("title", ["{ball}_{axis}", "{ball}.{axis}", "{axis}_{ball}", "{ball} {axis} [mm]"])
 def test_balls_side_by_side(title: str, tmp_path: Path) -> None:
     t, paths = _paths()
