@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.fall import LENGTHS
-from ballfg.importing.formats.raw import RawTable, is_number, numbers
+from ballfg.importing.formats.raw import MISSING, RawTable, is_number, numbers
 from ballfg.importing.names import Meaning, meanings
 from ballfg.importing.several_balls import identified
 from ballfg.importing.stamps import as_stamps
@@ -126,7 +126,7 @@ def _places(
     _refuse_images(table, groups)
     whole = [group for group in groups.values() if len(group) == 3]
     if not whole:
-        return _some_places(groups, given)
+        return _some_places(table, read, groups, given)
     ranks = [sum(meaning.rank for _, meaning in group.values()) for group in whole]
     best = [group for group, rank in zip(whole, ranks, strict=True) if rank == min(ranks)]
     if len(best) > 1 and not given:
@@ -142,15 +142,26 @@ def _places(
 
 
 def _some_places(
-    groups: Mapping[str, Mapping[str, tuple[str, Meaning]]], given: Mapping[str, str]
+    table: RawTable,
+    read: Mapping[str, list[Meaning]],
+    groups: Mapping[str, Mapping[str, tuple[str, Meaning]]],
+    given: Mapping[str, str],
 ) -> tuple[tuple[str, str, str] | None, str | None]:
-    """The columns of one or two axes, where no others are there."""
+    """The columns of one or two axes, where no others are there. Raises: ValueError: the others hold text."""
     axes = {axis: given[axis] for axis in "xyz" if axis in given}
     if not axes:
         plain = [group for group in groups.values() if all(meaning.rank == 0 for _, meaning in group.values())]
         axes = {axis: name for axis, (name, _) in plain[0].items()} if plain else {}
     if not axes:
         return None, None
+    for name, column in table.columns.items():
+        role = next((meaning.role for meaning in read.get(name, []) if meaning.rank == 0), "")
+        text = [] if is_number(column) else [str(cell) for cell in column if str(cell).lower() not in MISSING]
+        if role in set("xyz") - set(axes) and text:
+            what = f"{table.where}: column {shown(name)} must hold numbers; it holds {shown(text[0][:30])}"
+            raise ValueError(
+                f"{what}. Write its numbers with a point for the decimals, or name another one: --columns."
+            )
     units = [m.unit for group in groups.values() for name, m in group.values() if name in axes.values() and m.unit]
     x, y, z = (axes.get(axis, UNMEASURED) for axis in "xyz")
     return (x, y, z), units[0] if units else None

@@ -82,6 +82,18 @@ def points_in_thousands(folder: Path, shots: list[Track]) -> Path:
     return path
 
 
+def commas_in_thousands(folder: Path, shots: list[Track]) -> Path:
+    """Millimetres as an English spreadsheet shows them, 1,319.3152, with the minus sign of a typesetter."""
+    path = folder / "table.csv"
+    rows = [
+        [f"{v:,.{digits}f}".replace("-", "\u2212") for v, digits in zip((t, *(1e3 * p)), (9, 4, 4, 4), strict=True)]
+        for shot, times in zip(shots, one_after_the_other(shots), strict=True)
+        for t, p in zip(times, shot.positions, strict=True)
+    ]
+    path.write_text("\n".join(["time [s];x [mm];y [mm];z [mm]", *map(";".join, rows)]), encoding="utf-8")
+    return path
+
+
 def tabs_with_a_row_of_units(folder: Path, shots: list[Track]) -> Path:
     path = folder / "export.tsv"
     rows = [(t, *(p / 0.0254), 0.4) for shot in shots for t, p in zip(shot.times, shot.positions, strict=True)]
@@ -237,9 +249,10 @@ def headers_of_three_lines(folder: Path, shots: list[Track]) -> Path:
 
 Form = Callable[[Path, list[Track]], Path]
 FORMS: tuple[Form, ...] = (
-    csv_millimetres_y_up, semicolons_and_decimal_commas, points_in_thousands, tabs_with_a_row_of_units,
-    no_header_at_all, nested_json, json_lines_of_nanoseconds, parquet_of_dates_and_feet, excel_with_a_sheet_a_shot,
-    hdf5_with_z_down, npz_in_microseconds, matlab_structures, matlab_7_3, a_folder_with_one_file_a_shot, an_mcap_bag,
+    csv_millimetres_y_up, semicolons_and_decimal_commas, points_in_thousands, commas_in_thousands,
+    tabs_with_a_row_of_units, no_header_at_all, nested_json, json_lines_of_nanoseconds, parquet_of_dates_and_feet,
+    excel_with_a_sheet_a_shot, hdf5_with_z_down, npz_in_microseconds, matlab_structures, matlab_7_3,
+    a_folder_with_one_file_a_shot, an_mcap_bag,
 )  # fmt: skip
 
 

@@ -76,6 +76,11 @@ def text_between_numbers(f: Path, s: list[Track]) -> Path:
     return written(f / "a.csv", columns | {"x": x})
 
 
+def numbers_with_a_letter(f: Path, s: list[Track]) -> Path:
+    columns = columns_of(s)
+    return written(f / "a.csv", {**columns, "y": np.array([f"y{value}" for value in columns["y"].tolist()])})
+
+
 def units_in_every_cell(f: Path, s: list[Track]) -> Path:
     columns = columns_of(s, size=1e3)
     return written(f / "a.csv", columns | {a: np.array([f"{v} mm" for v in columns[a].tolist()]) for a in "xyz"})
@@ -192,6 +197,7 @@ REFUSED: dict[Mistake, str] = {
     feet_in_the_header_of_centimetres: "Decide it with --length cm",
     seconds_in_the_header_of_milliseconds: "Decide it with --time ms",
     two_clocks: "--columns t=time_camera (or t=time_host)",
+    numbers_with_a_letter: "column 'y' must hold numbers; it holds 'y",
     no_z: "--columns z=NAME",
     pixels: "ballfg track DETECTIONS --cameras",
     nothing: "the file is empty",

@@ -20,6 +20,7 @@ _COMMENTS: Final = ("#", "%", "//")
 _NUMBER: Final = re.compile(r"^[-+]?(\d++\.?\d*+|\.\d++)([eE][-+]?\d++)?$")
 _DECIMAL_COMMA: Final = re.compile(r"^[-+]?(?:\d{1,3}(?:\.\d{3})+|\d*),\d+([eE][-+]?\d++)?$")  # 1.234,5 too
 _POINTS_IN_THOUSANDS: Final = re.compile(r"^[-+]?\d{1,3}(?:\.\d{3})+(?:,\d+)?$")
+_COMMAS_IN_THOUSANDS: Final = re.compile(r"^[-+]?\d{1,3}(?:,\d{3})+(?:\.\d+)?$")
 _LOOK: Final = 200  # number of lines for finding the separator
 _HEAD: Final = 4096  # number of bytes at the beginning for recognising text
 _CONTROL: Final = 0.02  # share of control characters from which a file is not text
@@ -32,7 +33,7 @@ def decoded(path: Path) -> str:
     text = _text(path, whole_content(path))
     if not text.strip():
         raise ValueError(f"{path} must hold rows of numbers; the file is empty. Export it again.")
-    return text
+    return text.replace("\u2212", "-")  # the sign that typesetters and some spreadsheets write
 
 
 def _text(path: Path, content: bytes) -> str:
@@ -69,9 +70,10 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
     comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
     separator = _separator(rows_of_text)
     rows = _cells(rows_of_text, separator)
+    rows = _without_thousands(rows, _COMMAS_IN_THOUSANDS, ",", ".")
     comma = separator != "," or any(_DECIMAL_COMMA.match(cell) for row in rows[-5:] for cell in row)
     if comma and any(_DECIMAL_COMMA.match(cell) for row in rows for cell in row):
-        rows = [[_with_point(cell) for cell in row] for row in _without_thousands(rows)]
+        rows = [[_with_point(cell) for cell in row] for row in _without_thousands(rows, _POINTS_IN_THOUSANDS, ".", ",")]
     start = _first_data_row(rows)
     if start is None:
         shown = rows_of_text[0][:60] if rows_of_text else comments[0][:60]
@@ -96,12 +98,12 @@ def _with_point(cell: str) -> str:
     return cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell
 
 
-def _without_thousands(rows: list[list[str]]) -> list[list[str]]:
-    """Rows with decimal commas, where points in a number can only separate thousands: 1.234,5 and 1.234."""
-    pattern = _POINTS_IN_THOUSANDS
-    if not any("." in cell and "," in cell and pattern.match(cell) for row in rows for cell in row):
+def _without_thousands(rows: list[list[str]], pattern: re.Pattern[str], mark: str, decimal: str) -> list[list[str]]:
+    """Rows without the marks of thousands, where a number shows that they are: 1.234,5 or 1.234.567, then 1.234 too."""
+    told = (cell for row in rows for cell in row if mark in cell and (decimal in cell or cell.count(mark) > 1))
+    if not any(pattern.match(cell) for cell in told):
         return rows
-    return [[cell.replace(".", "") if pattern.match(cell) else cell for cell in row] for row in rows]
+    return [[cell.replace(mark, "") if pattern.match(cell) else cell for cell in row] for row in rows]
 
 
 def _separator(lines: Sequence[str]) -> str:
