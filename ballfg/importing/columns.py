@@ -1,6 +1,6 @@
 """Determines the role of each column by its name or else by its numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -37,6 +37,7 @@ class Roles:
     by_name: bool = True
     others: tuple[str, ...] = ()
     identities: tuple[str, ...] = ()  # columns that tell several balls of a trajectory apart
+    sigma_units: tuple[str | None, ...] = (None, None, None)  # of length, where the names state others than of x, y, z
 
 
 def roles_of(table: RawTable, choices: Choices) -> Roles | None:
@@ -96,7 +97,13 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         by_name,
         tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
         identities,
+        tuple(own if own in LENGTHS and own != units else None for own in _units(read, sigmas or ())),
     )
+
+
+def _units(read: Mapping[str, list[Meaning]], names: Iterable[str]) -> Iterator[str | None]:
+    """The unit in each name."""
+    return (next((meaning.unit for meaning in read.get(name, []) if meaning.unit), None) for name in names)
 
 
 def _existing(table: RawTable, name: str) -> str:

@@ -112,7 +112,7 @@ def import_tracks(
             of arrays (n,) or (n, 3), an array (n, 4) of t, x, y, z, or a list of these, one a shot.
         out: folder to write the dataset to; None keeps it in memory.
         columns: role -> name of the column; roles are t, frame, trajectory, x, y, z, sigma_x, sigma_y, sigma_z.
-        length: unit of positions and sigmas: m, cm, mm, in or ft.
+        length: unit of positions, and of sigmas whose names state no other one: m, cm, mm, in or ft.
         time: unit of stamps: s, ms, us or ns.
         up: axis of the source that points up: x, y, z, -x, -y or -z.
         flip: axis of the source whose sign is changed first, for a left-handed frame.

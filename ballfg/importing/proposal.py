@@ -1,7 +1,7 @@
 """A proposal holds the tracks of a source in SI units with z up, the flights of recordings, and every guess."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Any, Final
 
@@ -166,7 +166,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     frame, guesses = find_frame([relative(shot) for shot in some], choices, roles.length_unit, stated_time, time_why)
     shots, split_guess = split(shots, roles, frame, choices)
     shots = with_labels(shots, beside)
-    tracks, notes = _tracks(shots, frame)
+    tracks, notes = _tracks(shots, frame, roles.sigma_units)
     ball, ball_guess = ball_of(choices, frame)
     recorded = recordings(tracks)
     height, height_guess, table_doubt = table_of(tracks, recorded.cut, ball, choices)
@@ -208,7 +208,9 @@ def _flights(recorded: Recordings) -> list[Track]:
     return recorded.cut
 
 
-def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], list[str]]:
+def _tracks(
+    shots: Sequence[SourceShot], frame: Frame, sigma_units: Sequence[str | None]
+) -> tuple[list[Track], list[str]]:
     """Tracks in m and s with z up, and notes on their repairs."""
     far = [origin_of(shot.stamps, frame.time) for shot in shots]
     origin = min(far, key=abs) if all(far) else 0
@@ -218,7 +220,9 @@ def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], lis
         times = in_seconds(shot.stamps, frame.time, origin)
         parts = [times[:, None], frame.turned(frame.metres(shot.positions))]
         if shot.sigmas is not None:
-            parts.append(frame.metres(shot.sigmas) @ np.abs(np.array(TURNS[frame.up], dtype=np.float64)).T)
+            own = [replace(frame, length=unit or frame.length) for unit in sigma_units]
+            sigmas = np.stack([one.metres(column) for one, column in zip(own, shot.sigmas.T, strict=True)], axis=1)
+            parts.append(sigmas @ np.abs(np.array(TURNS[frame.up], dtype=np.float64)).T)
 
         def where(*rows: int, table: RawTable = shot.table) -> str:
             return f"{table.where}, rows {' and '.join(str(row + 1) for row in rows)}"
@@ -228,8 +232,8 @@ def _tracks(shots: Sequence[SourceShot], frame: Frame) -> tuple[list[Track], lis
         except ValueError as error:
             what = f"{str(error).rpartition('. ')[0]}; a column may tell two balls apart"
             raise UndecidedError(what, "columns", (), "trajectory=NAME") from None
-        sigmas = values[:, 4:] if values.shape[1] > 4 else None
-        tracks.append(Track(values[:, 0], values[:, 1:4], sigmas, frame.turned_spin(shot.labels), name=shot.name))
+        spreads = values[:, 4:] if values.shape[1] > 4 else None
+        tracks.append(Track(values[:, 0], values[:, 1:4], spreads, frame.turned_spin(shot.labels), name=shot.name))
     notes = findings.notes()
     if any(track.labels != shot.labels for track, shot in zip(tracks, shots, strict=True)):
         notes.append(f"spin labels turned with the axes: {frame.rotation}")

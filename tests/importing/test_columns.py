@@ -33,6 +33,22 @@ def test_sigmas_turn_with_the_axes_and_have_the_unit_of_the_positions(tmp_path: 
     assert proposal.info.imported["column sigmas"].startswith("sigma_x, sigma_y, sigma_z (sure")
 
 
+@pytest.mark.parametrize(
+    ("places", "sigma", "size", "sigma_size"),
+    [("[m]", "[mm]", 1.0, 1e-3), ("[mm]", "", 1e-3, 1e-3), ("[cm]", "[cm]", 0.01, 0.01), ("", "[mm]", 1.0, 1e-3)],
+)
+def test_sigmas_have_the_unit_of_their_own_names(
+    places: str, sigma: str, size: float, sigma_size: float, tmp_path: Path
+) -> None:
+    """Where the names state none, they have that of the positions."""
+    t, p = thrown()
+    names = ["t", *(f"{axis} {places}" for axis in "xyz"), *(f"sigma_{axis} {sigma}" for axis in "xyz")]
+    rows = np.column_stack((t, p / size, np.full_like(p, 0.5))).tolist()
+    (track,) = propose(write_rows(tmp_path / "a.csv", ",".join(names), rows), Choices()).tracks
+    np.testing.assert_allclose(track.positions, p, atol=1e-9)
+    np.testing.assert_allclose(track.sigmas, np.full_like(p, 0.5 * sigma_size), rtol=1e-12)
+
+
 @pytest.mark.parametrize("flip", [None, "x", "y", "z"])
 def test_a_spin_label_turns_with_the_axes(flip: str | None) -> None:
     """The Magnus force, spin x velocity, is the same force before and after the turn, in a mirrored frame too."""
