@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics import nominal_model
 from ballfg.importing.choices import Choices, Guess
-from ballfg.importing.frame import Frame
+from ballfg.importing.frame import SURE, Frame
 from ballfg.tracks import TABLE_TENNIS, Ball, Track
 from ballfg.tracks.info import NO_SURFACE, TENNIS
 
@@ -193,19 +193,24 @@ def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, flo
     return float(height), float(speed), float(np.sqrt(np.mean(residual**2)))
 
 
-def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
-    """The ball, by its drag, and the confidence in it. Raises: FileNotFoundError, ValueError: an unknown ball."""
+def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess, list[str]]:
+    """The ball, by its drag, the confidence in it, and a doubt where it falls as another one.
+
+    Raises: FileNotFoundError, ValueError: an unknown ball.
+    """
     if choices.ball is not None:
         from ballfg.simulation.balls import ball_kind
 
         ball = BALLS[choices.ball] if choices.ball in BALLS else ball_kind(choices.ball).ball
-        return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}")
-    why, sure = "too little flight to show the drag", "unsure"
+        return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}"), []
+    why, sure, doubts = "too little flight to show the drag", "unsure", []
     if frame.drag is not None and frame.windows >= _SURE_WINDOWS:
         why = f"the drag is only {frame.drag:.2f} 1/m (a tennis ball has 0.02): if it is another ball, name it"
         if frame.drag >= _TENNIS_DRAG:
             why, sure = f"drag {frame.drag:.2f} 1/m; a table-tennis ball has 0.13, a tennis ball 0.02", "likely"
-    return TABLE_TENNIS, Guess("ball", "table-tennis", why, sure, "--ball tennis")
+        elif frame.other_ball >= SURE:
+            doubts = [f"the ball flies with a drag of {frame.drag:.2f} 1/m, a table-tennis ball with 0.13: name it"]
+    return TABLE_TENNIS, Guess("ball", "table-tennis", why, sure, "--ball tennis"), doubts
 
 
 def table_of(

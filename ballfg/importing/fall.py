@@ -20,6 +20,7 @@ _STEPS: Final = (1e-4, 0.34)  # s between two samples: no camera is faster, and 
 _LEAST_SAMPLES: Final = 5
 _WIDTH: Final = 0.3  # gravities, standard deviation of an acceleration about its model: noise, spin, bounces
 _DRAGS: Final = np.linspace(0.0, 0.2, 11)  # 1/m; a table-tennis ball has 0.13, a tennis ball 0.02
+_TABLE_TENNIS: Final = 6  # index of the drag of a table-tennis ball, 0.12 1/m
 _MOST_WINDOWS: Final = 4000
 _MOST_SPEED: Final = 120.0  # m/s, largest speed; the fastest smash of any ball game is slower
 _COINCIDENCE: Final = 0.02  # share of windows that fit by chance; it keeps the ratio of two small scores near one
@@ -35,6 +36,7 @@ class Scale:
     score: float  # weighted share of the windows with the acceleration of a falling ball, 0 to 1
     windows: int
     drag: float  # 1/m, the quadratic drag that fits the windows best
+    other_ball: float = 1.0  # odds of that drag against the one of a table-tennis ball
 
 
 def scales(
@@ -81,7 +83,8 @@ def _scales(
                 misses = [np.sum((a - gravity - k * drag) ** 2, axis=1) for k in _DRAGS]
                 fits = [float(np.exp(-0.5 * miss / (_WIDTH * STANDARD_GRAVITY) ** 2).mean()) for miss in misses]
                 best = int(np.argmax(fits))
-                found.append(Scale(length, time, up, fits[best] if flying else 0.0, len(v), float(_DRAGS[best])))
+                score, other_ball = fits[best] if flying else 0.0, odds(fits[best], fits[_TABLE_TENNIS])
+                found.append(Scale(length, time, up, score, len(v), float(_DRAGS[best]), other_ball))
     return sorted(found, key=lambda scale: -scale.score)
 
 

@@ -12,7 +12,7 @@ from ballfg.importing.fall import AXES, LENGTHS, TIMES, Scale, Shot, odds, scale
 from ballfg.tracks.track import SPIN_LABELS, Label
 
 _LIKELY: Final = 2.0  # least odds of the best reading against the next
-_SURE: Final = 4.0
+SURE: Final = 4.0
 _AGAINST: Final = 4.0  # odds against a stated unit from which it is doubted
 _LEAST_SCORE: Final = 0.12  # least score of a falling ball
 _CLEAR_SCORE: Final = 0.3  # the same of a reading that is proposed against a stated one
@@ -44,6 +44,7 @@ class Frame:
     drag: float | None  # 1/m, from the falls
     windows: int = 0
     doubts: tuple[str, ...] = ()
+    other_ball: float = 1.0  # as of `Scale`
 
     def metres(self, positions: Array) -> Array:
         """(n, 3) m, in the axes of the source."""
@@ -109,7 +110,7 @@ def find_frame(
     drag = best.drag if best.score >= _LEAST_SCORE else None
     doubts = [f"the {line.what} is likely {line.value}: {line.why}" for line in lines if line.sure == "likely"]
     doubts += _better(shots, best) if choices.length or choices.time or choices.up else []
-    frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows, tuple(doubts))
+    frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows, tuple(doubts), best.other_ball)
     hand, sure = "taken for right-handed: positions cannot show it", "likely"
     if choices.flip:
         hand, sure = f"mirrored along {choices.flip} as stated", "stated"
@@ -145,7 +146,7 @@ def _line(
         why, sure = "as given", "stated"
     elif stated == value:
         why, sure = f"{named}, and the fall agrees" if best.score > _LEAST_SCORE else named, "sure"
-    elif _ratio(option, best, found) >= _SURE:
+    elif _ratio(option, best, found) >= SURE:
         sure = "sure"
     return Guess(_NAMES[option], value, why, sure, f"--{option} {value}")
 

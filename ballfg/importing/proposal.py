@@ -167,7 +167,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     shots, split_guess = split(shots, roles, frame, choices)
     shots = with_labels(shots, beside)
     tracks, notes = _tracks(shots, frame, roles.sigma_units)
-    ball, ball_guess = ball_of(choices, frame)
+    ball, ball_guess, ball_doubt = ball_of(choices, frame)
     recorded = recordings(tracks)
     height, height_guess, table_doubt = table_of(tracks, recorded.cut, ball, choices)
     flights_guess = recorded.guess(choices.flights)
@@ -183,7 +183,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
         rate=rate,
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
-        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights), *table_doubt),
+        doubts=(*_unseen(roles), *frame.doubts, *recorded.doubts(frame, choices.flights), *table_doubt, *ball_doubt),
     )
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]

@@ -95,6 +95,28 @@ def test_a_court_as_rough_as_its_ball_is_known_for_is_a_surface() -> None:
     assert bf.import_tracks(shots).info.table_height is None
 
 
+def _dragged(drag: float, speed: float, seed: int) -> np.ndarray:
+    """(n, 4) t, x, y, z, s and m, of a flight with a drag (1/m), in small steps of Euler's method."""
+    state, step, rows = np.array([0.0, 0.0, 1.0, 0.98 * speed, 0.0, 0.2 * speed]), 1e-4, []
+    for i in range(6000):
+        if i % 100 == 0:
+            rows.append([i * step, *state[:3]])
+        velocity = state[3:]
+        pull = np.array([0.0, 0.0, -9.81]) - drag * float(np.linalg.norm(velocity)) * velocity
+        state = state + step * np.concatenate((velocity, pull))
+    return np.array(rows) + np.random.default_rng(seed).normal(0.0, [0.0, 0.003, 0.003, 0.003], (60, 4))
+
+
+@pytest.mark.parametrize(
+    ("drag", "speed", "ball", "told"),
+    [(0.02, 25.0, None, True), (0.02, 25.0, "tennis", False), (0.12, 10.0, None, False), (0.0, 2.0, None, False)],
+    ids=["tennis", "named", "table tennis", "too slow to show a drag"],
+)
+def test_a_drag_of_another_ball_is_a_doubt(drag: float, speed: float, ball: str | None, *, told: bool) -> None:
+    doubts = bf.import_tracks([_dragged(drag, speed, seed) for seed in range(8)], ball=ball).info.doubts
+    assert any("the ball flies with a drag of 0.02 1/m, a table-tennis ball with 0.13" in one for one in doubts) == told
+
+
 @pytest.mark.parametrize(
     ("name", "role", "unit"),
     [
@@ -237,6 +259,6 @@ def test_places_that_stick_to_a_limit_and_stated_units_that_do_not_fall_are_doub
     clipped = bf.import_tracks(rows, length="m", time="s", up="z").info.doubts
     assert any(one.startswith("x is clipped: 6 times it stays at 0.9 m") for one in clipped)
     plain = [np.column_stack(shot) for shot in shots]
-    assert bf.import_tracks(plain, length="m", time="s", up="z").info.doubts == ()
+    assert bf.import_tracks(plain, length="m", time="s", up="z", ball="tennis").info.doubts == ()  # with little drag
     wrong = bf.import_tracks(plain, length="ft", time="s", up="z", table_height=0.0).info.doubts
     assert any("in m and s with z up, not in ft" in one for one in wrong)
