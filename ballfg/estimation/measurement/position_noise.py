@@ -63,22 +63,26 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
     times, positions = track.seconds[first], track.positions[first]
     if track.rough or len(times) < LEAST_WINDOWS + 2 * HALF_WINDOW:
         return ()
-    residuals = _window_residuals(times, positions)
-    if len(residuals) < LEAST_WINDOWS:
-        return ()
     white = sample_sigmas(settings, len(times), None if track.sigmas is None else track.sigmas[first])
     stated = total_sigmas(settings, white, partial(np.gradient, positions, times, axis=0))
-    seen, said = (float(np.sqrt(np.square(s).mean())) for s in (_robust_sigma(residuals), median(stated)))
+    residuals = _window_residuals(times, positions, stated)
+    if len(residuals) < LEAST_WINDOWS:
+        return ()
+    usual = median(stated)
+    seen, said = (float(np.sqrt(np.square(s).mean())) for s in (_robust_sigma(residuals * usual), usual))
     if seen <= MOST_SCATTER * said:
         return ()
+    remedy = "State position_noise (ballfg noise finds it)." if track.sigmas is None else "State larger ones."
     return (
         f"the positions scatter by {1e3 * seen:.2g} mm where their noise is stated as {1e3 * said:.2g} mm: sigmas are "
-        "too small, and good samples may be set aside. State position_noise (ballfg noise finds it).",
+        f"too small, and good samples may be set aside. {remedy}",
     )
 
 
-def _window_residuals(times: Array, positions: Array) -> Array:
+def _window_residuals(times: Array, positions: Array, sigmas: Array | None = None) -> Array:
     """(w, 11, 3) m, residuals of the cubic through each window, scaled to the standard deviation of one sample.
+
+    With `sigmas` (n, 3) m, of each sample, they are divided by their own standard deviations: dimensionless.
 
     A residual of least squares has variance sigma^2 (1 - h) with h the leverage; predicted without its own sample it is
     larger by 1 / (1 - h), so that r / sqrt(1 - h) standardises either of them.
@@ -89,14 +93,18 @@ def _window_residuals(times: Array, positions: Array) -> Array:
     stamps = sliding_window_view(times, size)
     short = stamps[:, -1] - stamps[:, 0] <= LONGEST_WINDOW
     stamps = stamps[short]
-    values = sliding_window_view(positions, size, axis=0)[short].transpose(0, 2, 1)
     centre = stamps[:, HALF_WINDOW, None]
     scaled = (stamps - centre) / (stamps[:, -1:] - stamps[:, :1])
     basis, _ = np.linalg.qr(scaled[..., None] ** np.arange(DEGREE + 1))
     leverage = np.einsum("wij,wij->wi", basis, basis)
+    values = sliding_window_view(positions, size, axis=0)[short].transpose(0, 2, 1)
     residuals = values - basis @ (basis.transpose(0, 2, 1) @ values)
-    left = np.sqrt((1.0 - leverage).clip(min=LEAST_LEFT))  # rounding may take it below zero
-    return np.asarray(residuals / left[..., None])
+    if sigmas is None:
+        left = np.sqrt((1.0 - leverage).clip(min=LEAST_LEFT))  # rounding may take it below zero
+        return np.asarray(residuals / left[..., None])
+    errors = sliding_window_view(sigmas**2, size, axis=0)[short].transpose(0, 2, 1)
+    kept = (np.eye(size) - basis @ basis.transpose(0, 2, 1)) ** 2 @ errors
+    return np.asarray(residuals / np.sqrt(np.maximum(kept, LEAST_LEFT * median(sigmas**2))))
 
 
 def _robust_sigma(residuals: Array) -> Array:

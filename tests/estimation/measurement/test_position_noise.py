@@ -41,6 +41,18 @@ def test_scatter_beyond_the_stated_noise_is_told(share, told, own):
         assert f"where their noise is stated as {1e3 * share * np.sqrt((SIGMA**2).mean()):.2g} mm" in notes[0]
 
 
+@pytest.mark.parametrize(("share", "told"), [(1.0, False), (0.3, True)])
+def test_good_and_bad_samples_with_sigmas_of_their_own(share, told):
+    """Two in five samples are six times worse, and say so: as where cameras miss the ball in turn."""
+    rng = np.random.default_rng(6)
+    sigmas = np.where(rng.random((120, 1)) < 0.6, 1.0, 6.0) * SIGMA
+    for _ in range(20):
+        track = bouncing(rng, sigma=sigmas)
+        notes = noise_doubts(Track(track.times, track.positions, share * sigmas), Settings())
+        assert bool(notes) == told
+        assert all(note.endswith("State larger ones.") for note in notes)
+
+
 def test_scatter_of_other_sources_is_no_noise_of_positions():
     """An error that lasts, and stamps that jitter, count as stated; rough positions and short tracks tell nothing."""
     track = bouncing(np.random.default_rng(4))
