@@ -137,6 +137,10 @@ def split_at_gaps(shots: Iterable[SourceShot], unit: float, gap: float) -> list[
 
 
 def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> Stamps:
+    if roles.time and choices.rate is not None:
+        what = f"--rate is for sources without times; {table.where} has them in {listed(roles.time)}"
+        remedy = "Leave --rate out, or name the column of frames: --columns frame=NAME"
+        raise ValueError(f"{what}, and got {choices.rate:g}. {remedy}.")
     if len(roles.time) == 2:
         return joined(*(table.columns[name] for name in roles.time))
     rate = choices.rate or roles.rate

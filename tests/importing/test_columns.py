@@ -192,6 +192,16 @@ def test_a_column_is_named_in_any_case_and_without_its_unit(tmp_path: Path) -> N
         propose(path, Choices(columns=chosen | {"x": "left"}))
 
 
+def test_a_rate_beside_times_is_refused_and_beside_frames_taken(tmp_path: Path) -> None:
+    t, p = thrown()
+    rows = np.column_stack((2.0 * np.arange(len(t)), t, p)).tolist()
+    path = write_rows(tmp_path / "a.csv", "frame,t,x,y,z", rows)
+    with pytest.raises(ValueError, match=r"--rate is for sources without times; .* has them in t, and got 200"):
+        propose(path, Choices(rate=200.0))
+    (track,) = propose(path, Choices({"frame": "frame"}, rate=200.0)).tracks
+    np.testing.assert_allclose(track.times, t, atol=1e-12)
+
+
 def test_two_clocks_that_tell_different_times_are_asked_about(tmp_path: Path) -> None:
     t, p = thrown()
     header = "host_time,camera_time,x,y,z"
