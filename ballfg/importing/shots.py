@@ -13,7 +13,7 @@ from ballfg.checks import MAX_TEXT, NAME_RULE, is_name, listed, short_text, show
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
-from ballfg.importing.names import says_seen
+from ballfg.importing.names import meanings, says_seen
 from ballfg.importing.stamps import Stamps, as_stamps, joined, missing
 from ballfg.tracks.track import Label
 
@@ -147,6 +147,9 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
     if not roles.time:
         frames = None if roles.frame is None else numbers(table.columns[roles.frame])
         if rate is None:
+            for name, cells in table.columns.items():
+                if not is_number(cells) and any(one.role == "t" for one in meanings(name)):
+                    raise _no_stamps(table, name)
             seen = (
                 f"has no column of times, but {listed(table.columns)}" if frames is None else "has frames but no time"
             )
@@ -155,10 +158,14 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
     column = table.columns[roles.time[0]]
     stamps = as_stamps(column)
     if stamps is None:
-        what = f"{table.where}: the column of times, {shown(roles.time[0])}, must hold numbers or dates"
-        raise UndecidedError(f"{what}; it holds {shown(str(column[0])[:30])}", "columns", (), "t=NAME")
+        raise _no_stamps(table, roles.time[0])
     counts.dates |= column.dtype.kind == "O"
     return stamps
+
+
+def _no_stamps(table: RawTable, name: str) -> UndecidedError:
+    rule = f"{table.where}: the column of times, {shown(name)}, must hold numbers or dates, as 2026-03-31 17:05:09.25"
+    return UndecidedError(f"{rule}; it holds {shown(str(table.columns[name][0])[:30])}", "columns", (), "t=NAME")
 
 
 def _at_restarts(stamps: Stamps, rows: NDArray[np.intp], counts: Counts) -> list[NDArray[np.intp]]:

@@ -202,6 +202,16 @@ def test_a_rate_beside_times_is_refused_and_beside_frames_taken(tmp_path: Path) 
     np.testing.assert_allclose(track.times, t, atol=1e-12)
 
 
+def test_a_time_that_is_not_read_is_named(tmp_path: Path) -> None:
+    """Not asked for a rate: frames may be missing, and the times would tell."""
+    t, p = thrown()
+    rows = [(f"03/31/2026 05:05:{5.0 + one:09.6f} PM", *row) for one, row in zip(t, p.tolist(), strict=True)]
+    path = write_rows(tmp_path / "a.csv", "time,x,y,z", rows)
+    with pytest.raises(UndecidedError, match=r"column of times, 'time', must hold numbers or dates, .* '03/31/2026"):
+        propose(path, Choices())
+    assert len(propose(path, Choices(rate=100.0)).tracks) == 1
+
+
 def test_two_clocks_that_tell_different_times_are_asked_about(tmp_path: Path) -> None:
     t, p = thrown()
     header = "host_time,camera_time,x,y,z"
