@@ -50,6 +50,11 @@ class BallFilter(FilterpyEKF):
         self.predicted[:width] = motion.after[0].numpy() + self.F[:width, :width] @ (self.x - point)[:width]
         return motion
 
+    def time_to_contact(self, within: float) -> float:
+        """The time until the next contact of the mean, s; infinite if there is none within so many s."""
+        motion = advance_jacobian(self.model, torch.from_numpy(self.x[: self.width])[None], within, self.surfaces)
+        return min((time for time, _ in motion.contacts), default=np.inf)
+
     @property
     def velocity_is_wide(self) -> bool:
         """True if the velocity is almost unknown."""
@@ -88,8 +93,13 @@ class BallFilter(FilterpyEKF):
         self.update(measured, lambda _: self.H, lambda x: self.H @ x)
 
     def correct_by(self, factor: FactorBatch, gated: bool) -> Array:
-        """(dim,) whitened innovation of a factor, by which the filter is updated if it passes the gate, if any."""
+        """(dim,) whitened innovation of a factor, by which the filter is updated if it passes the gate, if any.
+
+        NaN if the factor says nothing about the state, as a speed about a ball at rest.
+        """
         found = FilterInnovation.of(factor, self.x, self.P, biases=len(self.x) - self.width)
+        if not found.H.any():
+            return np.full(factor.dim, np.nan)
         if not gated or self.passes(found.whitened):
             self.update(np.zeros(factor.dim), lambda _: found.H, lambda _: found.residual, R=found.R)
         return found.whitened

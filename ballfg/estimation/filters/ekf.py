@@ -21,6 +21,7 @@ from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
+from ballfg.estimation.observations.reading import FARTHEST
 from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
@@ -332,11 +333,14 @@ class _Run:
     def _correct_beside(self, ball: "BallFilter", k: int) -> None:
         """Updates with all other measurements at sample k.
 
-        At the first sample a speed, whose Jacobian is zero without a velocity, is skipped with an innovation of NaN.
+        At the first sample a speed, whose Jacobian is zero without a velocity, is skipped with an innovation of NaN. So
+        is a measurement on the other side of a contact: the motion there does not follow from this state.
         """
         begins = k == self.record.start
+        since = max((c.time for c in self.record.contacts.get(k - 1, ())), default=-np.inf) - self.track.times[k]
+        until = ball.time_to_contact(FARTHEST) if self.beside else np.inf
         for observation, batch in self.beside.items():
-            for row in observation.filter_rows(k):
+            for row in observation.filter_rows(k, float(since), until):
                 one = batch.select(np.array([row]))
                 whitened = ball.correct_by(one, self.settings.find_events or begins)
                 if not begins or ball.passes(whitened):

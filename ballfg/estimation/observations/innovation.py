@@ -7,7 +7,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Rows
 from ballfg.factors.linear.covariance import Covariances
-from ballfg.factors.linear.definite import whitened
+from ballfg.factors.linear.definite import definite, variances_positive, whitened
 from ballfg.factors.linear.step import weighted
 from ballfg.state import POSITION, STATE_DIM
 
@@ -19,11 +19,16 @@ LEAST_JUDGED = 20  # Least number of measurements whose scatter is compared with
 class FilterInnovation:
     """One factor on a filter's predicted state, linearised there, as the input of its update.
 
+    To second order: within the prediction's spread a measurement such as a speed is no linear function of the state.
+    What its curvature adds to mean and covariance counts too (Athans, Wishner, Bertolini 1968), so that a measurement
+    counts little where it is far from linear.
+
     Attributes:
-        residual: (r,) whitened.  H: (r, d) whitened, per unit of the filter's state.
-        R: (r, r) noise of the whitened residual: one, divided by the weight that a robust loss gives the innovation.
+        residual: (r,) whitened, its mean.  H: (r, d) whitened, per unit of the filter's state.
+        R: (r, r) noise of the whitened residual: one and the part of the curvature, divided by the weight that a robust
+            loss gives the innovation.
         spread: (r, r) H P H^T, the covariance that the prediction adds to it.
-        whitened: (r,) the innovation divided by the root of its covariance before the loss, H P H^T + 1.
+        whitened: (r,) the innovation divided by the root of its covariance before the loss.
     """
 
     residual: Array
@@ -47,11 +52,29 @@ class FilterInnovation:
         H[:, :STATE_DIM] = blocks[0][0]
         if len(blocks) > 1:
             H[:, own] = blocks[1][0]
-        unit = np.eye(factor.dim)
+        bend = _bend(factor, inputs, blocks[0], covariance[:STATE_DIM, :STATE_DIM])
+        residual = residual + 0.5 * np.trace(bend, axis1=1, axis2=2)
+        noise = np.eye(factor.dim) + 0.5 * np.einsum("aij,bji->ab", bend, bend)
         spread = H @ covariance @ H.T
-        innovation = whitened(-residual, spread + unit)
+        innovation = whitened(-residual, spread + noise)
         (weight,) = factor.loss.weight(np.array([np.linalg.norm(innovation)]))
-        return cls(residual, H, unit / weight, spread, innovation)
+        return cls(residual, H, noise / weight, spread, innovation)
+
+
+def _bend(factor: FactorBatch, inputs: tuple[Array, ...], jacobian: Array, covariance: Array) -> Array:
+    """(r, 9, 9) whitened, second derivatives of the residual of a batch of one factor along the root of a covariance.
+
+    They are differences of Jacobians over one standard deviation: closer ones would not show how far a line holds.
+    Where a displaced state has no Jacobian, they are zero.
+    """
+    if not variances_positive(covariance):
+        return np.zeros((factor.dim, STATE_DIM, STATE_DIM))
+    root = np.linalg.cholesky(definite(covariance))
+    displaced = (inputs[0] + root.T, *(np.repeat(one, len(root), axis=0) for one in inputs[1:]))
+    with np.errstate(all="ignore"):
+        change = factor.compute(np.zeros(len(root), dtype=np.int64), displaced)[1][0] - jacobian
+    found = np.where(np.isfinite(change), change, 0.0).transpose(1, 0, 2) @ root
+    return np.asarray(0.5 * (found + found.swapaxes(1, 2)))
 
 
 def scatter(innovations: Array) -> float:

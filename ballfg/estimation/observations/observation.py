@@ -212,8 +212,11 @@ class Observation(ABC):
         """
         raise ValueError(f"the observation '{self.name}' has no table of its own: {type(self).__name__}.file is None")
 
-    def filter_rows(self, sample: int) -> Index:
-        """(k,) index of the batch's rows that a filter uses at a sample; empty if it uses positions in their place."""
+    def filter_rows(self, sample: int, since: float = -np.inf, until: float = np.inf) -> Index:
+        """(k,) index of the batch's rows that a filter uses at a sample; empty if it uses positions in their place.
+
+        Args: sample: its index.  since, until: s after its stamp; rows with a time of their own must lie within.
+        """
         return np.zeros(0, dtype=np.int64) if self.locates else np.flatnonzero(self.state == sample)
 
     def single_rows(self, batch: FactorBatch) -> Iterator[tuple[int, FactorBatch]]:

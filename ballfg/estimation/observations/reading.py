@@ -145,6 +145,11 @@ class Reading(Observation):
         """One factor a reading."""
         return ReadingFactors(self, context.model)
 
+    def filter_rows(self, sample: int, since: float = -np.inf, until: float = np.inf) -> Index:
+        """(k,) index of the readings of a sample, of a span of time about it."""
+        rows = super().filter_rows(sample)
+        return rows[(self.delay[rows] >= since) & (self.delay[rows] <= until)]
+
     def table(self, track: Track) -> Mapping[str, Array]:
         """Columns of the file, in order, without the trajectory: t (m,) s, the values (m,) and sigma (m,).
 

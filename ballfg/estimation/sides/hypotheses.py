@@ -73,8 +73,11 @@ class SampleMeasurement:
 def measured_at(
     track: Track, sigma: Array, batches: Mapping[Observation, FactorBatch], sample: int
 ) -> SampleMeasurement:
-    """The measurements at a sample of a track, given sigmas (n, 3) m and the factors of other observations."""
-    rows = [(batch, row) for one, batch in batches.items() for row in one.filter_rows(sample)]
+    """The measurements at a sample of a track, given sigmas (n, 3) m and the factors of other observations.
+
+    A reading between stamps may lie on the other side of the contact, so that it is left out.
+    """
+    rows = [(batch, row) for one, batch in batches.items() for row in one.filter_rows(sample, 0.0, 0.0)]
     factors = [batch.select(np.array([row])) for batch, row in rows]
     return SampleMeasurement(track.positions[sample], sigma[sample], factors)
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.stats import chi2
 
-from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
-from ballfg.estimation import ExtendedKalmanFilter, Online, RadarSpeed, Smoother, SpinReading
+from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model, rollout
+from ballfg.estimation import ExtendedKalmanFilter, Online, RadarSpeed, Settings, Smoother, SpinReading
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.observation import Context
 from ballfg.estimation.observations.reading import FARTHEST, Reading
@@ -34,6 +34,7 @@ from tests.estimation.observations.flights import (
 )
 
 METHODS = (Smoother, Online, ExtendedKalmanFilter)
+TABLE = Surfaces.table_tennis(0.76)
 DELAYS = (None, (0.004, 0.0, -0.003))
 
 
@@ -231,6 +232,47 @@ def test_the_filter_leaves_out_a_speed_before_it_knows_a_velocity() -> None:
     estimate = ExtendedKalmanFilter(gravity_model(), NOWHERE, PLAIN).estimate(track.observed(speeds))
     assert np.isnan(estimate.innovations["speed"]).tolist() == [[True], [False]]
     assert np.abs((estimate.states[-1] - truth[-1]) / estimate.sigmas[-1]).max() < 4.0
+
+
+def bounced_with_a_fast_radar(seed: int) -> tuple[Track, np.ndarray]:
+    """A camera of 25 Hz and a radar of 200 Hz with stamps of its own: the flight with two bounces, and its truth."""
+    rng = np.random.default_rng(seed)
+    spread = [0.0, 0.0, 0.0, 0.4, 0.2, 0.3, 20.0, 0.0, 0.0]
+    start = np.array([-1.2, 0.0, 1.0, 4.0, 0.0, -0.2, 0.0, 80.0, 10.0]) + spread * rng.standard_normal(9)
+    stamps = np.arange(14) / 25
+    readings = np.arange(0.0017, stamps[-1], 0.005)
+    times = np.sort(np.append(stamps[1:], readings))
+    path = rollout(nominal_model(), torch.from_numpy(start)[None], torch.from_numpy(times), TABLE)[0].detach().numpy()
+    truth = np.vstack((start, path[np.isin(times, stamps)]))
+    track = Track(stamps, truth[:, :3] + rng.normal(0.0, 0.003, (len(stamps), 3)))
+    speeds = np.linalg.norm(path[np.isin(times, readings), 3:6], axis=1) + rng.normal(0.0, 0.02, len(readings))
+    return track.observed(RadarSpeed.at(track, readings, speeds, 0.02)), truth
+
+
+@pytest.mark.parametrize("sort", [Smoother, pytest.param(Online, marks=pytest.mark.thorough), ExtendedKalmanFilter])
+def test_speeds_between_stamps_leave_covariances_honest(sort: type) -> None:
+    """From the first sample on, where a filter knows no velocity, and beside bounces that lie between the stamps."""
+    settings = Settings.for_measured(nominal_model(), position_noise=(0.003,) * 3)
+    squares = []
+    for seed in range(24):
+        track, truth = bounced_with_a_fast_radar(seed)
+        estimate = sort(nominal_model(), TABLE, settings).estimate(track)
+        off = (estimate.states - truth)[:, 3:6, None]
+        squares.append((off.swapaxes(1, 2) @ np.linalg.solve(estimate.covariances[:, 3:6, 3:6], off)).ravel())
+    assert np.mean(squares) < 3.0  # chi-square with 3 degrees of freedom, of a model that allows for more than there is
+    assert np.max(squares) < chi2.isf(1e-4 / np.size(squares), 3)
+
+
+def test_a_filter_counts_the_curvature_of_a_measurement() -> None:
+    """The speed of a ball whose velocity is hardly known has the mean and the spread of many possible balls."""
+    truth = flight(0, 2)[1]
+    sigma = np.repeat([0.002, 1.0, 30.0], 3)
+    speeds = PlainSpeed([0], np.array([6.0]), 0.02).batch(context_of(flight(0, 2)[0]))
+    found = FilterInnovation.of(speeds, truth[0], np.diag(sigma**2))
+    drawn = truth[0, 3:6] + np.random.default_rng(0).standard_normal((100000, 3))
+    many = np.linalg.norm(drawn, axis=1)
+    np.testing.assert_allclose(6.0 + 0.02 * found.residual, many.mean(), rtol=0.01)
+    np.testing.assert_allclose(0.02 * np.sqrt(found.spread + found.R)[0], many.std(), rtol=0.05)
 
 
 def test_pushed_readings_are_those_of_the_track() -> None:
