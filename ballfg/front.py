@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict, Unpack, cast, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.checks import check_count, check_instance, check_path, type_name
+from ballfg.checks import check_count, check_instance, check_path, shown, type_name
 from ballfg.dynamics import BallModel, Surfaces, load_model, nominal_model
 from ballfg.dynamics.nominal import inertia_factor
 from ballfg.estimation import Estimate, Estimator, Settings
@@ -308,15 +308,23 @@ def graph(
     Returns: factors, values at the smoother's estimate, keys of the states; `Estimate.from_gtsam` leads back.
     Raises:
         TypeError: for anything else in place of a track.
-        ValueError: a track without a graph, a model with measurement effects, or as `estimate`.
+        ValueError: a track without a graph or with more than a flight, a model with measurement effects, or as
+            `estimate`.
     """
     track = _opened(measured)
     if not isinstance(track, Track):
         raise TypeError("measured must be one track; got a dataset. Choose a track of it by its name.")
     from ballfg.estimation import Smoother, TrackGraph
+    from ballfg.estimation.flights.estimates import Seen
 
     found = estimator_for(track, "smoother", model, surfaces, settings).of(track)
-    return TrackGraph.of(Smoother(found.model, found.surfaces, found.settings), track)
+    smoother = Smoother(found.model, found.surfaces, found.settings)
+    if not Seen.of(smoother, track).whole:  # its graph would explain a ball in a hand by flight and hits
+        raise ValueError(
+            f"track {shown(track.name)} must be one flight; got a ball that is also held, rolls or rests. Take one of "
+            "bf.flights(track)."
+        )
+    return TrackGraph.of(smoother, track)
 
 
 def estimator_for(

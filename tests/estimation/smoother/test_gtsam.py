@@ -204,6 +204,19 @@ def test_tracks_without_a_graph_are_refused() -> None:
         bf.TrackGraph.of(Impossible(bf.nominal_model(), TABLE, settings()), track)
 
 
+def test_of_a_recording_the_graph_is_that_of_a_flight() -> None:
+    """A ball is held, thrown and caught; the graph of all of it would be one flight with hits in the hand."""
+    times = np.arange(240) / 100
+    flown = np.clip(times - 0.8, 0.0, 0.8)[:, None]
+    path = [0.0, 0.0, 1.5] + flown * [3.0, 0.0, 4.0] - flown**2 * [0.0, 0.0, 4.905]
+    recording = bf.Track(times, path + np.random.default_rng(0).normal(0.0, 0.002, path.shape))
+    with pytest.raises(ValueError, match=r"must be one flight; got a ball that is also held.* of bf.flights\(track"):
+        bf.graph(recording)
+    (flight,) = bf.flights(recording)
+    graph = bf.graph(flight)
+    assert np.allclose(bf.Estimate.from_gtsam(graph, graph.values).states[:, 3], 3.0, atol=0.2)
+
+
 class Impossible(bf.Smoother):
     """Says that the ball bounces on a surface 60 m below."""
 
