@@ -169,6 +169,8 @@ class Estimate:
     def from_gtsam(cls, graph: "TrackGraph", values: "gtsam.Values") -> "Estimate":
         """The estimate of a track at values from GTSAM, with the marginals of all factors of the graph.
 
+        Unlike `bf.estimate` it takes one side of a contact near the track's end, the one at the values.
+
         Args: graph: from `bf.graph`, with further factors or without.  values: of all variables of the factors.
         Raises: RuntimeError: GTSAM's, if the factors leave a variable undetermined.
         """

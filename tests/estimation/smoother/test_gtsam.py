@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import weakref
 from dataclasses import replace
 from typing import Any
@@ -25,6 +26,7 @@ from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import DatasetInfo
 from tests.estimation.gtsam_solver import SAME, Solvers, difference, distance, simulated
 from tests.estimation.observations.sighted_rig import scene, track_of, world
+from tests.places import DOCS
 
 NOISE = (0.003, 0.003, 0.003)
 TABLE = 0.76
@@ -202,6 +204,14 @@ def test_tracks_without_a_graph_are_refused() -> None:
         bf.graph(track, model=tilted, surfaces=TABLE)
     with pytest.raises(ValueError, match="track '000': the objective is not finite at the start"):
         bf.TrackGraph.of(Impossible(bf.nominal_model(), TABLE, settings()), track)
+
+
+def test_the_tutorial_s_camera_takes_a_tracker_with_memory_too(capsys: pytest.CaptureFixture[str]) -> None:
+    """The state then has 12 numbers; a Jacobian for 9 of them makes GTSAM's system indeterminate."""
+    text = (DOCS / "tutorials" / "7_a_camera_by_gtsam.md").read_text(encoding="utf-8")
+    code = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+    exec(compile(code.replace("position_noise=", "memory=(0.002,) * 3, position_noise="), "tutorial", "exec"), {})
+    assert "within 3 sigma: True" in capsys.readouterr().out
 
 
 def test_of_a_recording_the_graph_is_that_of_a_flight() -> None:
