@@ -205,7 +205,8 @@ class FactorBatch(ABC):
 
     def linearize(self, values: Values) -> Rows:
         """All factors at a point."""
-        return self.rows(values, *self.compute(slice(None), self.inputs(values)))
+        inputs = self.inputs(values)
+        return self.rows(values, *shaped(self, inputs, *self.compute(slice(None), inputs)))
 
     def rows(self, values: Values, residual: Array, jacobians: tuple[Array, ...]) -> Rows:
         """The linearised factors from the results of `compute` for all of them.
@@ -223,6 +224,35 @@ class FactorBatch(ABC):
                 for j, of_coefficients in zip(jacobians, shared, strict=True)
             )
         return Rows(self.variables, residual, jacobians, self.loss)
+
+
+def shaped(
+    batch: FactorBatch, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...]]:
+    """The results of a batch, contiguous, after checks of number, shapes and type.
+
+    Raises: ValueError: names the batch, the array and the rule.
+    """
+    name, count = type(batch).__name__, len(inputs[0])
+    if len(jacobians) != len(inputs):
+        raise ValueError(
+            f"{name}.compute must return one Jacobian per variable, {len(inputs)}; got {len(jacobians)}. "
+            "Return a tuple, in the order of variables; GTSAM ends the interpreter where one is left out."
+        )
+    expected: list[tuple[str, Array, tuple[int, ...]]] = [("residual", residual, (count, batch.dim))]
+    expected += [(f"Jacobian {i}", block, (count, batch.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)]
+    for label, array, shape in expected:
+        _check_array(f"{name}.compute: {label}", array, shape)
+    return np.ascontiguousarray(residual), tuple(np.ascontiguousarray(block) for block in jacobians)
+
+
+def _check_array(what: str, array: Array, shape: tuple[int, ...]) -> None:
+    if not isinstance(array, np.ndarray):
+        raise ValueError(f"{what} must be a numpy array of shape {shape}; got {type(array).__name__}")
+    if array.shape != shape:
+        raise ValueError(f"{what} must have shape {shape}; got {array.shape}")
+    if array.dtype != np.float64:
+        raise ValueError(f"{what} must be float64; got {array.dtype}. Convert the model with .double().")
 
 
 class DiagonalFactors(FactorBatch):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values, shaped
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear.step import weighted
 from ballfg.state import STATE_DIM
@@ -104,7 +104,7 @@ class Bridge:
         """`prepare` for a trial point: of rows that are not finite, only the inputs are cached."""
         self.calls += 1
         with np.errstate(over="ignore", invalid="ignore"):
-            residual, jacobians = shaped(self.batch, rows, inputs, *self.batch.compute(rows, inputs))
+            residual, jacobians = shaped(self.batch, inputs, *self.batch.compute(rows, inputs))
         finite = np.asarray(np.isfinite(residual).all(axis=1))
         for block in jacobians:
             finite &= np.isfinite(block).all(axis=(1, 2))
@@ -218,7 +218,7 @@ def checked(
 
     Raises: ValueError: names the batch, the array, the row and the rule.
     """
-    residual, jacobians = shaped(batch, rows, inputs, residual, jacobians)
+    residual, jacobians = shaped(batch, inputs, residual, jacobians)
     named = [("residual", residual), *((f"Jacobian {i}", block) for i, block in enumerate(jacobians))]
     for label, array in named:
         if not np.isfinite(array).all():
@@ -226,35 +226,6 @@ def checked(
             row = k if isinstance(rows, slice) else int(rows[k])
             raise ValueError(_not_finite(f"{type(batch).__name__}.compute: {label}", row))
     return residual, jacobians
-
-
-def shaped(
-    batch: FactorBatch, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
-) -> tuple[Array, tuple[Array, ...]]:
-    """The results of a batch, contiguous, after checks of number, shapes and type.
-
-    Raises: ValueError: names the batch, the array and the rule.
-    """
-    name, count = type(batch).__name__, len(inputs[0])
-    if len(jacobians) != len(inputs):
-        raise ValueError(
-            f"{name}.compute must return one Jacobian per variable, {len(inputs)}; got {len(jacobians)}. "
-            "A block left out would end the interpreter."
-        )
-    expected: list[tuple[str, Array, tuple[int, ...]]] = [("residual", residual, (count, batch.dim))]
-    expected += [(f"Jacobian {i}", block, (count, batch.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)]
-    for label, array, shape in expected:
-        _check_array(f"{name}.compute: {label}", array, shape)
-    return np.ascontiguousarray(residual), tuple(np.ascontiguousarray(block) for block in jacobians)
-
-
-def _check_array(what: str, array: Array, shape: tuple[int, ...]) -> None:
-    if not isinstance(array, np.ndarray):
-        raise ValueError(f"{what} must be a numpy array of shape {shape}; got {type(array).__name__}")
-    if array.shape != shape:
-        raise ValueError(f"{what} must have shape {shape}; got {array.shape}")
-    if array.dtype != np.float64:
-        raise ValueError(f"{what} must be float64; got {array.dtype}. Convert the model with .double().")
 
 
 def _not_finite(what: str, row: int) -> str:

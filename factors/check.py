@@ -62,12 +62,35 @@ def check_factor(batch: FactorBatch, values: Values, tolerance: float = 1e-6, st
     """The worst relative error of a batch's Jacobians.
 
     Args: batch: any.  values: the point.  tolerance: relative to a block's largest element.  step: see `STEP`.
-    Raises: AssertionError: if the error of a block is larger; the message names the worst.
+    Raises: AssertionError: if the error of a block is larger; the message names the worst. If a row by itself, as
+        filters and GTSAM ask for it, is not that of the whole batch.
     """
     worst = max(jacobian_errors(batch, values, step), key=lambda error: error.relative)
     if not worst.relative <= tolerance:
         raise AssertionError(f"{type(batch).__name__}: {worst}; allowed {tolerance:.1e}")
+    _check_rows(batch, values)
     return worst.relative
+
+
+def _check_rows(batch: FactorBatch, values: Values) -> None:
+    """Compares every row by itself with that of the whole batch.
+
+    Raises: AssertionError: naming the first that differs.
+    """
+    whole = batch.linearize(values).residual
+    inputs = batch.inputs(values)
+    for row in range(len(batch)):
+        own, only = tuple(block[[row]] for block in inputs), np.array([row])
+        try:
+            alone = [batch.compute(only, own)[0], batch.select(only).compute(slice(None), own)[0]]
+            same = all(np.allclose(one, whole[only], equal_nan=True) for one in alone)
+        except (IndexError, ValueError):  # numpy's, where arrays of one row meet arrays of all
+            same = False
+        if not same:
+            raise AssertionError(
+                f"{type(batch).__name__}: row {row} by itself must be that of the whole batch. Name all attributes "
+                "with one entry a factor in row_arrays, and index them by rows in compute."
+            )
 
 
 def _differences(batch: FactorBatch, inputs: tuple[Array, ...], column: int, step: float) -> Array:

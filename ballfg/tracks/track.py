@@ -218,7 +218,9 @@ def _checked_observations(where: str, observations: object, samples: int, rough:
         last = int(np.max(observation.state, initial=0))
         if last >= samples:
             rule = f"{where}: state of {shown(observation.name)} must be the index of a sample, at most {samples - 1}"
-            raise ValueError(f"{rule}; got {last}. Readings with times of their own: {type(observation).__name__}.at.")
+            of_any_time = f"Readings with times of their own: {type(observation).__name__}.at."
+            remedy = of_any_time if hasattr(observation, "at") else "Count samples from 0."
+            raise ValueError(f"{rule}; got {last}. {remedy}")
     names = [observation.name for observation in found]
     if len(set(names)) < len(names):
         raise ValueError(f"{where}: observations must have different names; got {names}. Join those of one name.")

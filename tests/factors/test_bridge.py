@@ -12,6 +12,7 @@ import torch
 from ballfg.dynamics import nominal_model, rollout
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation import Smoother
 from ballfg.estimation.observations.registry import OBSERVATIONS
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge, from_gtsam, key_of, nonlinear_graph, to_gtsam
@@ -22,6 +23,7 @@ from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import coefficient_prior, spin_prior, state_prior
+from ballfg.tracks import Track
 from tests.places import DOCS
 
 N = 12
@@ -283,6 +285,58 @@ def test_the_checker_names_the_bad_block(rng):
     with pytest.raises(AssertionError, match=r"FlightFactors: row 4, block 2 \(by c\), entry \(3, 1\)"):
         check_factor(kind, start)
     assert sum(error.relative > 1e-6 for error in jacobian_errors(kind, start)) == 1
+
+
+class Heights(FactorBatch):
+    """r = (z_i - measured_i) / sigma, right or with a mistake of a user's."""
+
+    row_arrays = ("variables", "measured")
+
+    def __init__(self, measured, mistake=None):
+        super().__init__(np.arange(len(measured))[:, None], 1)
+        self.measured, self.mistake = np.asarray(measured), mistake
+        if mistake == "unnamed":
+            self.row_arrays = ("variables",)
+
+    def compute(self, rows, inputs):
+        measured = self.measured if self.mistake == "unindexed" else self.measured[rows]
+        residual = (inputs[0][:, 2:3] - measured[: len(inputs[0]), None]) / 0.01
+        jacobian = np.tile(np.eye(1, 9, 2) / 0.01, (len(residual), 1, 1))
+        if self.mistake == "flat":
+            return residual[:, 0], (jacobian,)
+        if self.mistake == "single":
+            return residual.astype(np.float32), (jacobian,)
+        return residual, jacobian if self.mistake == "bare" else (jacobian,)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        ("flat", r"Heights.compute: residual must have shape \(3, 1\); got \(3,\)"),
+        ("single", "Heights.compute: residual must be float64; got float32"),
+        ("bare", "Heights.compute must return one Jacobian per variable, 1; got 3"),
+    ],
+)
+def test_the_smoother_names_what_is_wrong_in_a_batch_of_a_user(mistake, message):
+    times = np.arange(20) / 100
+    track = Track(times, np.outer(times, [3.0, 0.0, 1.0]) - np.outer(times**2, [0.0, 0.0, 4.9]) + [0.0, 0.0, 0.9])
+    with pytest.raises(ValueError, match=message):
+        Smoother(nominal_model(), 0.0).estimate(track, factors=[Heights([0.9, 0.9, 0.9], mistake)])
+
+
+def test_a_factor_on_a_sample_that_a_track_lacks_is_refused():
+    track = Track(np.arange(3) / 100, np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"the index of a sample, at most 2; got 3\. Count samples from 0"):
+        Smoother(nominal_model(), 0.0).estimate(track, factors=[Heights([0.9] * 4)])
+
+
+@pytest.mark.parametrize("mistake", ["unnamed", "unindexed"])
+def test_the_checker_finds_rows_that_are_not_their_own(mistake):
+    """Filters and GTSAM would take the first row's measurement for every one."""
+    values = Values(np.tile(np.arange(9.0), (3, 1)), np.zeros(0))
+    assert check_factor(Heights([1.0, 2.0, 3.0]), values) < 1e-6
+    with pytest.raises(AssertionError, match=r"Heights: row 1 by itself must be that of the whole batch\. Name all"):
+        check_factor(Heights([1.0, 2.0, 3.0], mistake), values)
 
 
 def test_the_checker_passes_every_kind(rng):
