@@ -1,15 +1,18 @@
 """Checks and registers the effects that a model file may name: those of this folder and those of other packages."""
 
+import inspect
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Final, NamedTuple
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
+from ballfg.checks import type_name
 from ballfg.dynamics import effects
-from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, FlightEffect, Kind, Range, Usual
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Kind, Range, Usual
 from ballfg.dynamics.effects import generic
 from ballfg.dynamics.measurement import MeasurementEffect
 from ballfg.dynamics.wording import said
@@ -17,6 +20,8 @@ from ballfg.files.python_file import defined_classes, load_classes
 from ballfg.registry import Registry
 
 REMEDY = "docs/add_an_effect.md has an example."
+COLUMNS: Final = {"air_velocity": 3, "acceleration": 3, "spin_rate": 3, "surface_offset": 1, "surface_slope": 2}
+"""Columns of what methods return."""
 BASES = (FlightEffect, BounceEffect, MeasurementEffect)
 
 
@@ -41,6 +46,38 @@ def check_effect(effect: type[Effect]) -> None:
             f"{effect.name}.needs must name known effects; got '{unknown[0]}'. Register that one first, or define it "
             "above."
         )
+    _check_methods(effect)
+
+
+def _check_methods(effect: type[Effect]) -> None:
+    """Refuses a class that does nothing, as one with a misspelt method, and methods whose results have wrong shapes.
+
+    Fewer columns would be taken for every axis: torch repeats them without a word.
+    """
+    base = next(base for base in BASES if issubclass(effect, base))
+    methods = [name for name, own in vars(base).items() if inspect.isfunction(own) and not name.startswith("_")]
+    if all(getattr(effect, name) is getattr(base, name) for name in methods):
+        raise ValueError(
+            f"{effect.__qualname__} must have one of the methods {', '.join(methods)}; it has none of them."
+        )
+    state = torch.arange(1.0, 19.0, dtype=torch.float64).reshape(2, 9)
+    example = {"flight": Flight(state, 0.02), "bounce": state[:, :3]}
+    for name in [name for name in methods if name in COLUMNS]:
+        where, columns = f"{effect.__qualname__}.{name}", COLUMNS[name]
+        try:
+            with torch.no_grad():
+                found = getattr(effect(), name)(example[effect.kind])
+        except Exception as error:
+            raise ValueError(f"{where} must take a batch of two balls; it raises {error!r}. {REMEDY}") from error
+        shapes = ((), (1,), (2, 1)) if columns == 1 else ((columns,), (1, columns), (2, columns))
+        if found is None:
+            continue
+        if not isinstance(found, Tensor) or found.dtype != torch.float64 or tuple(found.shape) not in shapes:
+            what = f"{tuple(found.shape)}, {found.dtype}" if isinstance(found, Tensor) else type_name(found)
+            raise ValueError(
+                f"{where} must return (..., {columns}) in float64, of a batch of two balls (2, {columns}); got {what}. "
+                f"{REMEDY}"
+            )
 
 
 def _check_knowledge(effect: type[Effect]) -> None:

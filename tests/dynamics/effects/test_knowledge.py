@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import pytest
+import torch
+from torch import Tensor
 
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.diagnosis.report.wording import in_plain_words, plain_name
 from ballfg.diagnosis.result import Finding, Value
 from ballfg.diagnosis.search.plausible import implausible, range_of
-from ballfg.dynamics import EFFECTS, Coefficient, FlightEffect, MeasurementEffect, Range, Usual, register
+from ballfg.dynamics import EFFECTS, Coefficient, Flight, FlightEffect, MeasurementEffect, Range, Usual, register
 from ballfg.dynamics.effects import registry
 from ballfg.dynamics.wording import said
 
@@ -56,6 +58,9 @@ class Bare(FlightEffect):
     sentence = "The sea pulls. It is far."
     decide = "Leave the sea."
     coefficients = (Coefficient("a", 0.0, 0.5, "m/s^2", -20.0, 20.0),)
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        return self.a * torch.ones_like(flight.velocity)
 
 
 class Knowing(Bare):

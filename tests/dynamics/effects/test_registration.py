@@ -12,7 +12,7 @@ import torch
 from cloudpickle import dumps  # what worker processes are sent with
 
 from ballfg.dynamics import EFFECTS, Coefficient, FlightEffect, load_effects, nominal_model, register
-from ballfg.dynamics.measurement import MeasurementEffect
+from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.dynamics.model_file import model_from_dict
 
 LIFT = '''"""Two effects, the second of which changes the first; a base of both."""
@@ -78,6 +78,7 @@ def push(**changes: object) -> type[FlightEffect]:
         "sentence": "A push.",
         "decide": "Do not push.",
         "coefficients": (Coefficient("a", 0.0, 0.1, "m/s^2", -5.0, 5.0),),
+        "acceleration": lambda self, flight: self.a * torch.ones_like(flight.velocity),
     }
     body = {name: value for name, value in (body | changes).items() if value is not None}
     return type("Push", (FlightEffect,), body)
@@ -206,6 +207,9 @@ def test_a_measurement_effect_and_a_decorator() -> None:
         decide = "Listen."
         coefficients = (Coefficient("share", 0.0, 0.1, "1", -1.0, 1.0),)
 
+        def positions(self, states: torch.Tensor, later: Later) -> torch.Tensor:
+            return (1.0 + self.share) * states[..., :3]
+
     model = nominal_model()
     content = {"flight": {"gravity": {}}, "bounce": {}, "measurement": {"own_echo": {"share": 0.2}}}
     assert isinstance(model_from_dict(content, radius=model.radius).measurement["own_echo"], Echo)
@@ -214,3 +218,35 @@ def test_a_measurement_effect_and_a_decorator() -> None:
 def test_an_unknown_effect_says_how_to_make_it_known() -> None:
     with pytest.raises(ValueError, match=r"of your own must be registered first: --effects-file FILE\.py, or ballfg"):
         model_from_dict({"flight": {"own_lift": {}}, "bounce": {}})
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        (
+            "def accelerate(self, flight): return -self.a * flight.velocity",
+            "Silent must have one of the methods air_velocity, adj",
+        ),
+        (
+            "def acceleration(self, flight): return -self.a * flight.speed",
+            r"Silent.acceleration must return \(..., 3\) in float64, of a batch of two balls \(2, 3\); got \(2, 1\), ",
+        ),
+        (
+            "def spin_rate(self, flight): return (self.a * flight.spin).float()",
+            r"Silent.spin_rate .* \(2, 3\), torch.fl",
+        ),
+        ("def air_velocity(self, flight): return [1.0, 0.0, 0.0]", "Silent.air_velocity must return .* got list"),
+        ("def acceleration(self, flight): return flight.drag", "Silent.acceleration must take a batch .*no attribute"),
+    ],
+    ids=["misspelt", "one column", "single precision", "list", "raises"],
+)
+def test_an_effect_that_would_do_nothing_or_act_along_every_axis_is_refused(
+    tmp_path: Path, method: str, message: str
+) -> None:
+    words = 'name = "silent"; sentence = "It does nothing."; decide = "Look."'
+    coefficients = 'coefficients = (Coefficient("a", 0.5, 0.1, "1/s", -5.0, 5.0),)'
+    head = "from ballfg.dynamics import Coefficient, FlightEffect\n\n\nclass Silent(FlightEffect):\n"
+    (tmp_path / "silent.py").write_text(f"{head}    {words}\n    {coefficients}\n    {method}\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        load_effects(tmp_path / "silent.py")
+    assert "silent" not in EFFECTS
