@@ -107,6 +107,8 @@ class Estimate:
         notes: doubts about the track: an axis that does not fall, bounces where no surface is declared.
         labels: (n,) numbers of what samples show, as in `Label` (docs/import.md);
             empty for an estimator that is called by itself. What is no flight has its measured position.
+
+    Raises: ValueError: states or covariances of another shape.
     """
 
     name: str
@@ -131,6 +133,13 @@ class Estimate:
     notes: tuple[str, ...] = ()
     other_sides: Array = field(default_factory=lambda: np.zeros((0, 9, 9)))
     labels: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+
+    def __post_init__(self) -> None:
+        n = len(self.times)
+        for name, shape in (("states", (n, STATE_DIM)), ("covariances", (n, STATE_DIM, STATE_DIM))):
+            if np.shape(getattr(self, name)) != shape:
+                got = np.shape(getattr(self, name))
+                raise ValueError(f"{name} of an Estimate must have shape {shape}; got {got}. Give one a stamp.")
 
     def __len__(self) -> int:
         return len(self.times)
@@ -183,8 +192,8 @@ class Estimate:
 
     @property
     def whitened(self) -> Array:
-        """(m, dim) whitened innovations of the observation that locates the ball."""
-        return next(iter(self.innovations.values()))
+        """(m, dim) whitened innovations of the observation that locates the ball; NaN (n, 3) without any."""
+        return next(iter(self.innovations.values()), np.full((len(self), 3), np.nan))
 
     @property
     def sigmas(self) -> Array:

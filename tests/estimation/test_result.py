@@ -31,6 +31,24 @@ def test_sigmas_and_nis() -> None:
     assert np.isnan(estimate.error)
 
 
+def test_an_estimate_without_innovations_has_no_numbers_for_them() -> None:
+    """As from an estimator of a user's; a StopIteration would end the caller's loop without a word."""
+    estimate = Estimate("t", np.arange(2.0), np.zeros((2, 9)), np.zeros((2, 9, 9)), Status.OK)
+    assert np.isnan(estimate.whitened).all()
+    assert estimate.whitened.shape == (2, 3)
+    assert np.isnan(estimate.nis).all()
+
+
+def test_states_and_covariances_are_one_a_stamp() -> None:
+    times, states = np.arange(2.0), np.zeros((2, 9))
+    with pytest.raises(
+        ValueError, match=r"covariances of an Estimate must have shape \(2, 9, 9\); got \(2, 9\)\. Give"
+    ):
+        Estimate("t", times, states, states, Status.OK)
+    with pytest.raises(ValueError, match=r"states of an Estimate must have shape \(2, 9\); got \(2, 6\)\. Give"):
+        Estimate("t", times, states[:, :6], np.zeros((2, 9, 9)), Status.OK)
+
+
 def test_whitened_innovations_have_unit_covariance() -> None:
     """Their squared length is the Mahalanobis distance; drawn from the covariance, their scatter is the identity."""
     rng = np.random.default_rng(0)
