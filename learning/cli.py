@@ -6,10 +6,11 @@ Heavy libraries are imported inside functions: `ballfg-train --help` must not wa
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from ballfg.cli import inputs
 from ballfg.cli.start import guarded, start
 from ballfg.machine import usable_cores
 from ballfg.progress import alive, announce, idle, progress
@@ -18,6 +19,23 @@ if TYPE_CHECKING:
     from ballfg.learning.config.training import TrainConfig
 
 app = typer.Typer(name="ballfg-train", add_completion=False, pretty_exceptions_enable=False)
+
+
+class OwnFiles(NamedTuple):
+    """Files that define effects and observations of one's own."""
+
+    effects: list[Path]
+    observations: list[Path]
+
+    def know(self) -> None:
+        """Registers them in this process."""
+        inputs.know_effects(self.effects)
+        inputs.know_observations(self.observations)
+
+    def typed(self) -> list[str]:
+        """The options that name them."""
+        pairs = (("--effects-file", self.effects), ("--observations-file", self.observations))
+        return [word for option, files in pairs for file in files for word in (option, str(file))]
 
 
 @app.command()
@@ -33,6 +51,8 @@ def train(
     ] = None,
     out: Annotated[str | None, typer.Option("--out", help="Output folder; must not hold an earlier run.")] = None,
     resume: Annotated[str | None, typer.Option("--resume", help="Folder of an earlier run to continue.")] = None,
+    effects_file: inputs.EffectsFiles = None,
+    observations_file: inputs.ObservationsFiles = None,
 ) -> None:
     """Train a model of the ball on a dataset: a network, or the coefficients of the analytic model.
 
@@ -55,7 +75,8 @@ def train(
     settings = read_config(config, overrides or (), {key: value for key, value in options.items() if value})
     if not settings.data:
         raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
-    folder = Path(settings.out)
+    folder, own = Path(settings.out), OwnFiles(effects_file or [], observations_file or [])
+    own.know()
     if isinstance(settings, CalibrationConfig):
         if isinstance(settings.data, str):
             from ballfg.learning.calibration.run import run_calibration as calibrate
@@ -63,19 +84,20 @@ def train(
             from ballfg.learning.calibration.sets import calibrate_sets as calibrate
         status = calibrate(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
-        typed = _typed(config, overrides or (), data or (), out, resume)
-        status = _train(settings, folder, resume is not None, typed)
+        typed = shlex.join([*_typed(config, overrides or (), data or (), out, resume), *own.typed()])
+        status = _train(settings, folder, resume is not None, typed, own)
     if status:
         raise SystemExit(status)
 
 
-def _typed(config: Path, overrides: Sequence[str], data: Sequence[str], out: str | None, resume: str | None) -> str:
+def _typed(
+    config: Path, overrides: Sequence[str], data: Sequence[str], out: str | None, resume: str | None
+) -> list[str]:
     words = ["ballfg-train", str(config), *overrides, *(word for folder in data for word in ("--data", folder))]
-    words += [word for option, folder in (("--out", out), ("--resume", resume)) if folder for word in (option, folder)]
-    return shlex.join(words)
+    return words + [word for option, one in (("--out", out), ("--resume", resume)) if one for word in (option, one)]
 
 
-def _train(config: "TrainConfig", folder: Path, resume: bool, typed: str) -> int:
+def _train(config: "TrainConfig", folder: Path, resume: bool, typed: str, own: OwnFiles) -> int:
     """Train in this process if a launcher has started it or one is enough, else in new processes.
 
     Returns: the exit status.
@@ -89,7 +111,7 @@ def _train(config: "TrainConfig", folder: Path, resume: bool, typed: str) -> int
     check(folder, config, resume=resume)  # refuse a bad folder before the processes start
     announce(f"starting {jobs} processes")
     with idle():  # the first of the processes speaks, and prints the reason of its status
-        return launch(jobs, _train_guarded, config, folder, resume, typed)
+        return launch(jobs, _train_guarded, config, folder, resume, typed, own)
 
 
 def _train_here(config: "TrainConfig", folder: Path, resume: bool, typed: str) -> int:
@@ -98,13 +120,14 @@ def _train_here(config: "TrainConfig", folder: Path, resume: bool, typed: str) -
     return run_training(config, folder, resume=resume, watch=progress, command=typed)
 
 
-def _train_guarded(config: "TrainConfig", folder: Path, resume: bool, typed: str) -> int:
+def _train_guarded(config: "TrainConfig", folder: Path, resume: bool, typed: str, own: OwnFiles) -> int:
     """The work of each process that this command starts. Returns: its exit status; none where it was interrupted."""
     from ballfg.learning.run.ranks import NO_STATUS
 
     def work() -> int:
         try:
             with alive("ballfg-train"):
+                own.know()
                 return _train_here(config, folder, resume, typed)
         except KeyboardInterrupt:  # this command says so
             return NO_STATUS

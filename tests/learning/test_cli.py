@@ -11,8 +11,10 @@ from typing import Any
 import pytest
 import yaml
 
+import ballfg as bf
 from ballfg.cli.main import run as ballfg
-from ballfg.dynamics import load_model
+from ballfg.dynamics import EFFECTS, load_model
+from ballfg.estimation.observations.registry import OBSERVATIONS
 from ballfg.learning.calibration import run as calibration
 from ballfg.learning.calibration.coefficients import values_of
 from ballfg.learning.cli import run
@@ -161,6 +163,44 @@ def test_resume_refuses_another_run(
     (out / "checkpoint.json").write_text('{"data": 1}')
     assert status(*given, "--resume", out) == 2
     assert "not a checkpoint" in capsys.readouterr().err
+
+
+RADIAL = """from ballfg.estimation import Reading
+
+
+class Across(Reading):
+    name, file, columns = "across", "across.csv", ("vy",)
+
+    def predicted(self, state):
+        return state[..., 4:5]
+"""
+PULL = """import torch
+
+from ballfg.dynamics import Coefficient, FlightEffect
+
+
+class Pull(FlightEffect):
+    name, sentence, decide = "pull", "Something pulls.", "Remove it."
+    coefficients = (Coefficient("a", 0.0, 0.1, "m/s^2", -5.0, 5.0),)
+
+    def acceleration(self, flight):
+        return self.a * torch.ones_like(flight.velocity)
+"""
+
+
+def test_effects_and_observations_of_one_s_own_reach_every_process(few_tracks: Path, tmp_path: Path) -> None:
+    shutil.copytree(few_tracks, tmp_path / "shots")
+    rows = ["trajectory,t,vy,sigma", *(f"{name},0.1,0.0,0.1" for name in bf.read(few_tracks).names)]
+    (tmp_path / "shots" / "across.csv").write_text("\n".join(rows) + "\n")
+    model = "{flight: {gravity: {}, drag: {}, magnus: {}, pull: {a: 0.01}}, bounce: {restitution: {}, friction: {}}}"
+    for name, text in (("across.py", RADIAL), ("pull.py", PULL), ("model.yaml", model), ("a.yaml", "kind: a-tune\n")):
+        (tmp_path / name).write_text(text)
+    keys = ("observe.samples=25", "augment=false", "optimizer.epochs=1", "jobs=2", f"model={tmp_path / 'model.yaml'}")
+    given = (tmp_path / "a.yaml", *keys, "--data", tmp_path / "shots", "--out", tmp_path / "run")
+    files = ("--effects-file", tmp_path / "pull.py", "--observations-file", tmp_path / "across.py")
+    with EFFECTS.restored(), OBSERVATIONS.restored():
+        assert status(*given, *files) in (0, 1)
+        assert load_model(tmp_path / "run" / "model.yaml").flight["pull"].values()["a"] == pytest.approx(0.01, abs=0.1)
 
 
 def test_bad_input_is_one_line_and_writes_nothing(
