@@ -232,4 +232,10 @@ class ReadingFactors(FactorBatch):
         values, sigma, delay = (torch.from_numpy(a[rows]) for a in (self.values, self.sigma, self.delay))
         if bool(delay.any()):
             state = rk4_step(self.model.rates, state, delay.unsqueeze(-1))
-        return (self.predicted(state) - values) / sigma
+        found, shape = self.predicted(state), (*state.shape[:-1], self.dim)
+        if found.shape != shape:  # torch would repeat a single column for all, without a word
+            raise ValueError(
+                f"{self.sort.__name__}.predicted must return (..., {self.dim}), one number a column; got "
+                f"{tuple(found.shape)} of states {tuple(state.shape)}. Keep the last axis: sum(-1, keepdim=True)."
+            )
+        return (found - values) / sigma

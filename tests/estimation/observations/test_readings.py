@@ -66,6 +66,24 @@ def test_jacobians_and_the_residual_in_torch(sort: type[Reading], delay: tuple[f
         np.testing.assert_allclose(slope.numpy(), jacobian[:, column], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("predicted", "columns"),
+    [
+        (lambda _, state: state[..., 3:6].norm(dim=-1), ("speed",)),
+        (lambda _, state: state[..., 3:4], ("vx", "vy")),
+        (lambda _, state: state[..., 3:6], ("speed",)),
+    ],
+    ids=["without its axis", "one for both columns", "too many"],
+)
+def test_a_reading_predicts_one_number_a_column(method: type, predicted: object, columns: tuple[str, ...]) -> None:
+    sort = type("Mine", (PlainSpeed,), {"predicted": predicted, "columns": columns})
+    track, truth, _ = flight(0, 5)
+    own = sort([0, 1, 2], truth[:3, 3 : 3 + len(columns)], 0.05)
+    with pytest.raises(ValueError, match=rf"Mine.predicted must return \(..., {len(columns)}\), one number a column"):
+        method(gravity_model(), NOWHERE, PLAIN).estimate(track.observed(own))
+
+
 def test_a_ball_at_rest_has_a_speed_and_no_direction() -> None:
     batch = RadarSpeed([0], [2.0], 0.5).batch(context_of(flight(0, 1)[0]))
     residual, (jacobian,) = batch.compute(slice(None), (np.zeros((1, 9)),))
