@@ -35,7 +35,7 @@ def error_budget(
     Raises:
         TypeError: if the model is a learned one.
         ValueError: if there are too few tracks, none with a flight that is long enough, or none that is predicted
-            without a hit.
+            without a hit from samples of which most are no outliers.
     """
     model, tell = analytic(model), watch or (lambda line: None)
     holdout = hold_out(dataset, model, jobs, tell)
@@ -51,8 +51,8 @@ def error_budget(
     budget = budget_of(fitted, holdout, before.prediction_rmse_mm, after.prediction_rmse_mm, jobs)
     if budget is None:
         raise ValueError(
-            "tracks must be predicted through flights and bounces alone; the model sees a hit in each of them. Give it "
-            "the right coefficients, or longer tracks."
+            "tracks must be predicted through flights and bounces alone; the model sees a hit in each of them, or more "
+            "outliers than samples. Give it right stamps and coefficients, or longer tracks."
         )
     return budget
 
@@ -101,11 +101,15 @@ def expected_squares(
 
 
 def _samples(linear: LinearTracks, tracks: Sequence[EvaluationTrack]) -> tuple[Tensor, Tensor]:
-    """(t, n) bool, observed and predicted samples of the tracks that are linearised as a whole; none of the others."""
+    """(t, n) bool, observed and predicted samples of the tracks that are linearised as a whole; none of the others.
+
+    Nor of those of which most observed samples are outliers: a prediction knows what this linearisation leaves out.
+    """
     observed, predicted = np.zeros((2, *linear.times.shape), dtype=bool)
     for row, number in enumerate(linear.numbers):
         track, moving = tracks[number].track, np.diff(linear.times[row].numpy()) > 0.0
         if np.flatnonzero(moving)[-1] + 2 == len(track):
             seen = len(track.opening(OBSERVED * track.duration))
-            observed[row, :seen], predicted[row, seen : len(track)] = True, True
+            if linear.used[row, :seen].double().mean() > 0.5:
+                observed[row, :seen], predicted[row, seen : len(track)] = True, True
     return torch.from_numpy(observed), torch.from_numpy(predicted)

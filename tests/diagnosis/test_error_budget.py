@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from ballfg.diagnosis.budget import EXPECTED, PARTS, RECORDED, ErrorBudget
@@ -47,6 +48,17 @@ def test_a_wrong_model_has_the_same_floor_and_much_left(flown, make_ball, surfac
         budgets.append(ErrorBudget.of(expected, tracks, error, error))
     assert budgets[1].floor == pytest.approx(budgets[0].floor, rel=0.1)
     assert budgets[1].left > budgets[1].floor > abs(budgets[0].left)
+
+
+def test_a_track_whose_observed_samples_are_outliers_does_not_count(flown, make_ball, surfaces):
+    """Stamps of one track that count frames, of which every fifth was lost: its motion jumps all the time."""
+    right, _ = expected_squares(make_ball(), flown, surfaces, SETTINGS)
+    track, kept = flown[0].track, np.arange(len(flown[0].track)) % 5 != 4
+    counted = replace(track, times=track.times[: kept.sum()], positions=track.positions[kept])
+    others = [replace(flown[0], track=counted), *flown[1:]]
+    expected, tracks = expected_squares(make_ball(), others, surfaces, SETTINGS)
+    assert tracks == len(flown) - 1
+    assert sum(expected.values()) == pytest.approx(sum(right.values()), rel=0.1)
 
 
 def test_without_a_flight_nothing_is_expected(make_ball, surfaces):
