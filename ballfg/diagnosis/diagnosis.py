@@ -11,7 +11,7 @@ from ballfg.diagnosis.error_budget import budget_of
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, analytic, hold_out
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.generic_test import ALARM, GenericTest
+from ballfg.diagnosis.generic_test import ALARM, APART, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import sentence
 from ballfg.diagnosis.residual_tests.generic import generic_tests
@@ -205,7 +205,7 @@ def share_left(tests: Sequence[GenericTest]) -> float:
 
 def what_is_left(tests: tuple[GenericTest, ...], helped: Fallback | None = None) -> Unexplained:
     """The remaining pattern, in words, with all tests; helped: its description without a name."""
-    left = sorted(alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
+    left = sorted(alarms(tests), key=lambda test: test.name in ("time", APART))  # a place says more than a correlation
     return Unexplained(left[0].where if left else "", share_left(tests), tests, helped)
 
 

@@ -6,6 +6,9 @@ from typing import Final
 ALARM: Final = 0.005
 """Probability that any test of a complete fit raises an alarm: smaller p-values are alarms."""
 
+APART: Final = "tracks"
+"""Name of the test for whiteness where nothing is left once each track has its own coefficients."""
+
 
 @dataclass(frozen=True)
 class GenericTest:
@@ -13,7 +16,8 @@ class GenericTest:
 
     Attributes:
         name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
-            against flights) or `time` (whiteness along the tracks).
+            against flights), `time` (whiteness along the tracks) or `tracks` (the same, where each track's own
+            coefficients explain it).
         where: place, dependence and size of the pattern in words.
         p_value: probability of such a pattern by chance; for `label`, that every label is right.
         share: remaining part of the initial pattern, 0 to 1.

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.diagnosis.fit.patterns import EVERYWHERE
-from ballfg.diagnosis.generic_test import ALARM
+from ballfg.diagnosis.generic_test import ALARM, APART
 from ballfg.diagnosis.report import wording
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.residual_tests.label_check import LABEL
@@ -23,6 +23,7 @@ PLACES: Final = {
     "contact": "at bounces",
     "measurement": "in the measured positions",
     "recording": "along the recording",
+    APART: "from track to track",
     "label": "in the spin labels",
     "time": "from sample to sample",
 }
@@ -193,6 +194,8 @@ def _to_look_at(pattern: str) -> str:
         return "measure the spin of these tracks once more, and check the axes and the unit of the labels"
     if pattern.startswith("time: "):
         return "look for what delays or smooths the positions between the camera and the file"
+    if pattern.startswith(f"{APART}: "):
+        return "note for each shot which ball flew and what else was changed, as labels; or fly one ball at one setting"
     if EVERYWHERE in pattern:
         return "record tracks at other speeds, spins and places than these"
     return "record tracks in which it varies more"

@@ -13,7 +13,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.patterns import DRIFT, EVERYWHERE, PLAUSIBLE, Block, blocks_of, describe_drift, drift_block
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.generic_test import ALARM, APART, GenericTest
 from ballfg.diagnosis.hypotheses.signatures import signatures_of
 from ballfg.diagnosis.residual_tests.whiteness import whiteness
 from ballfg.diagnosis.search.score import pattern_tests
@@ -29,13 +29,17 @@ MOST_SEEN = 95.0
 
 @dataclass(frozen=True)
 class _Test:
-    """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none."""
+    """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none.
+
+    `cause` is a kind that explains all of the pattern, or empty.
+    """
 
     kind: str
     quantities: tuple[str, ...]
     where: str
     p_value: float
     size: float
+    cause: str = ""
 
 
 def generic_tests(fit: Fit, reference: Fit | None = None, tracker: TrackNoise | None = None) -> tuple[GenericTest, ...]:
@@ -54,7 +58,7 @@ def generic_tests(fit: Fit, reference: Fit | None = None, tracker: TrackNoise | 
     for test in tests:
         whole = max(test.size, sizes.get((test.kind, test.quantities), 0.0))
         share = test.size / whole if whole > 0.0 else 0.0
-        found.append(GenericTest(test.kind, test.where, min(1.0, len(tests) * test.p_value), share))
+        found.append(GenericTest(test.cause or test.kind, test.where, min(1.0, len(tests) * test.p_value), share))
     return tuple(sorted(found, key=lambda t: t.p_value))
 
 
@@ -62,9 +66,19 @@ def _tests_of(fit: Fit, tracker: TrackNoise | None) -> list[_Test]:
     system = fit.linearised
     drifting = drift_block(fit, system)
     drift = whiteness(fit, system, tracker)
+    apart = _apart(fit, system, tracker) if drift.p_value < ALARM else ""
     tests = _block_tests(fit, system, [*blocks_of(fit), *([] if drifting is None else [drifting])])
-    tests.append(_Test("time", (), drift.where, drift.p_value, drift.drift**2))
+    tests.append(_Test("time", (), apart or drift.where, drift.p_value, drift.drift**2, APART if apart else ""))
     return tests
+
+
+def _apart(fit: Fit, system: System, tracker: TrackNoise | None) -> str:
+    """What differs from track to track if that leaves nothing of a drift along the tracks, in words; else empty."""
+    own = [number for number, name in enumerate(fit.problem.free) if name not in fit.problem.deviations]
+    if not own or whiteness(fit, system, tracker, own).p_value < ALARM:
+        return ""
+    most = min(own, key=lambda number: whiteness(fit, system, tracker, [number]).drift)
+    return f"{APART}: coefficients differ from each track to the next, {list(fit.problem.free)[most]} most of all"
 
 
 def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:

@@ -8,6 +8,7 @@ sum of U over stretches is compared with the gamma distribution of the same firs
 Errors of a tracker with known memory or jitter are whitened by their covariance first.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,8 @@ REACHES = (0.02, 0.06, 0.18)
 """s. Widths of the Gaussian kernels in the time between two samples: from a contact's duration to an arc's."""
 LEAST_WEIGHT = 0.5
 """Samples with a smaller robust weight are outliers: their products carry no information on drift."""
+LEAST_SIZE = 1e-6
+"""Least relative size of a direction among the columns of a stretch: less is rounding."""
 LEAST_FREEDOM = 1e-6
 """Least degrees of freedom of a stretch; one whose samples are all outliers has none."""
 
@@ -49,10 +52,12 @@ class Whiteness:
         return f"time: samples within {1e3 * self.reach:.0f} ms err alike, by {1e3 * self.drift:.2g} mm"
 
 
-def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Whiteness:
+def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None, own: Sequence[int] = ()) -> Whiteness:
     """The test of a fit for drift along its tracks, from its system, linearised at its minimum.
 
-    Args: tracker: white noise, memory and jitter of the tracker; None: errors are assumed white.
+    Args:
+        tracker: white noise, memory and jitter of the tracker; None: errors are assumed white.
+        own: columns of shared unknowns of which each stretch has its own value.
     """
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
@@ -60,14 +65,14 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Wh
     rows = np.ones(system.residual.shape)  # without outliers, whose pull on the fit would look like drift
     rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
     system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
-    if tracker is None:
-        projected = system.projected()
-    else:  # the fit has weighted its samples as if their errors were white
+    if tracker is not None:  # the fit has weighted its samples as if their errors were white
         system = _whitened(fit, system, kept, tracker)
-        projected = system.projected()
+    local = _directions(np.concatenate((system.by_start, system.by_common[..., list(own)]), axis=-1))
+    projected = system.columns - local @ (local.swapaxes(-1, -2) @ system.columns)
+    if tracker is not None:
         projected[..., -1] -= projected[..., :-1] @ _common_step(fit, system)
     residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
-    taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
+    taken = _absorbed(fit, local, projected[..., :-1]).reshape(n, k, 3, -1)
     sums, spreads, p_values, products = [], [], [], []
     for reach in REACHES:
         times, sample = stretches.times.numpy(), np.arange(k)
@@ -173,13 +178,18 @@ def _trace(matrices: Array) -> Array:
     return np.asarray(np.trace(matrices, axis1=-2, axis2=-1))
 
 
-def _absorbed(fit: Fit, system: System, shared: Array) -> Array:
-    """(n, 3 k, 9 + q) directions of the samples' noise that first states and shared unknowns (n, m, q) absorb.
+def _directions(columns: Array) -> Array:
+    """(n, m, d) orthogonal directions of unit length of columns (n, m, d) in each stretch; zero for missing ones."""
+    length = np.linalg.norm(columns, axis=1, keepdims=True)
+    found, sizes, _ = np.linalg.svd(columns / np.where(length > 0.0, length, 1.0), full_matrices=False)
+    return np.asarray(found * (sizes > LEAST_SIZE * sizes.max(axis=-1, keepdims=True))[:, None])
 
-    They have unit length, over the rows of a stretch and over all rows; first states are projected out of the shared.
+
+def _absorbed(fit: Fit, local: Array, shared: Array) -> Array:
+    """(n, 3 k, d + q) directions of the samples' noise that local (n, m, d) and shared unknowns (n, m, q) absorb.
+
+    They have unit length, over the rows of a stretch and over all rows; local ones are projected out of the shared.
     """
-    own, _ = np.linalg.qr(system.by_start)
     precision = (shared.swapaxes(-1, -2) @ shared).sum(axis=0) + np.diag(fit.problem.common_precision)
     root = np.linalg.inv(np.linalg.cholesky(precision)).T
-    rows = system.residual.shape[1] - 3
-    return np.concatenate((own[:, :rows], (shared @ root)[:, :rows]), axis=-1)
+    return np.concatenate((local, shared @ root), axis=-1)[:, :-3]

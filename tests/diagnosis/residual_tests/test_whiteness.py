@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy import stats
 
+from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.generic_test import ALARM
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.whiteness import _p_value, _summed, whiteness
@@ -67,6 +68,20 @@ def test_a_memory_is_an_alarm_until_it_is_known(lasting):
     assert whiteness(lasting, system, TRACKER).p_value > 0.01
     (time,) = [t for t in generic_tests(lasting, tracker=TRACKER) if t.name == "time"]
     assert time.p_value > ALARM
+
+
+def test_balls_that_differ_from_track_to_track_are_no_tracker(lasting, make_ball, make_launches, make_shots, make_fit):
+    """Twelve balls of as many masses: all of the drift is in their drags. Not so a memory."""
+    rng, parts = np.random.default_rng(7), []
+    for number, launch in enumerate(make_launches(12, 84)):
+        ball = make_ball(drag={"k": 0.12 + 0.03 * rng.standard_normal()})
+        shot = make_shots(ball, launch[None], number).stretches
+        parts.append(replace(shot, names=(f"{number:03d}",), track=np.array([number])))
+    found, *_ = generic_tests(make_fit(make_ball(), joined(parts)))
+    assert (found.name, found.p_value < ALARM) == ("tracks", True)
+    assert "flight.drag.k most of all" in found.where
+    memory, *_ = generic_tests(lasting)
+    assert (memory.name, memory.p_value < ALARM) == ("time", True)
 
 
 def test_a_tracker_that_is_taken_to_be_white_changes_nothing(calm_fit):
