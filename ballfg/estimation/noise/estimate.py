@@ -215,11 +215,16 @@ def linearised(
     """
     plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
     tracks = [track.since_first() for track in tracks]
-    if not model.measures_plainly:  # of measured positions as they happened
-        inverse = InvertMeasurement(Smoother, model, surfaces, plain)
-        undone = map_tracks(inverse.undo, tracks, len(tracks), jobs)
-        tracks, model = [one.track for one in undone], plainly_measured(model)
-    return linearise(Smoother(model, surfaces, plain), tracks, watch, jobs=jobs)
+    if model.measures_plainly:
+        return linearise(Smoother(model, surfaces, plain), tracks, watch, jobs=jobs)
+    inverse = InvertMeasurement(Smoother, model, surfaces, plain)  # of measured positions as they happened
+    undone = [one.track for one in map_tracks(inverse.undo, tracks, len(tracks), jobs)]
+    plain = replace(plain, spin_label_noise=inverse.smoother.settings.spin_label_noise)
+    found = linearise(Smoother(plainly_measured(model), surfaces, plain), undone, watch, jobs=jobs)
+    if found is None or settings.launcher is not None:  # whose spins are no labels
+        return found
+    spread = plain.spin_label_noise / settings.spin_label_noise
+    return replace(found, label_spreads=torch.full_like(found.label_spreads, spread))
 
 
 def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> list[T]:

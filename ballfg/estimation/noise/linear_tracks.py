@@ -52,6 +52,7 @@ class LinearTracks:
         labelled: (t,) bool, True if a label gives the spin at the first sample.
         group_sigmas: (t, 3) rad/s, prior standard deviations of the first spin along the axes of its population; NaN
             where none gives it. The first state's spin counts along these axes.
+        label_spreads: (t,) standard deviation of a spin that a label gives, for 1 rad/s of the label's own.
         coefficient_sigmas: (p,) prior standard deviations, in the coefficients' own units.
     """
 
@@ -67,6 +68,7 @@ class LinearTracks:
     starts: Tensor
     labelled: Tensor
     group_sigmas: Tensor
+    label_spreads: Tensor
     coefficient_sigmas: Tensor
 
     def __len__(self) -> int:
@@ -82,7 +84,7 @@ class LinearTracks:
             velocity: m/s, standard deviation per axis.
         """
         count = len(self)
-        spins = torch.where(self.labelled, label, spin)[:, None].expand(count, 3)
+        spins = torch.where(self.labelled, self.label_spreads * label, spin)[:, None].expand(count, 3)
         spins = torch.where(self.group_sigmas.isnan(), spins, self.group_sigmas).square()
         fixed = torch.tensor([START_POSITION_SIGMA**2] * 3 + [velocity**2] * 3, dtype=torch.float64)
         own = (coefficients[:, None] * self.coefficient_sigmas).square()
@@ -165,6 +167,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
         "starts": start,
         "labelled": np.array(label is not None and label.measured),
         "group_sigmas": group_sigmas,
+        "label_spreads": np.array(1.0),
     }
 
 

@@ -76,7 +76,8 @@ def parameters_of(
         found.append(Parameter("contact_spin", None, process.contact_spin, FACTOR_FOUR, 0.5, 300.0))
     if bool(tracks.labelled.any()):
         label = settings.spin_label_noise if settings.launcher is None else settings.launcher.sigma
-        found.append(Parameter("spin_label", None, label, FACTOR_FOUR, 1.0, 300.0))
+        unit = float(tracks.label_spreads[0])
+        found.append(Parameter("spin_label", None, label, FACTOR_FOUR, 1.0 / unit, 300.0 / unit))
     if not bool((tracks.labelled | ~tracks.group_sigmas.isnan().any(dim=1)).all()):
         found.append(Parameter("spin_prior", None, settings.spin_prior, FACTOR_FOUR, 3.0, 500.0))
     if settings.coefficients:

@@ -1,6 +1,7 @@
 """The noise that tracks show: planted numbers come back, and intervals with them hold what they promise."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, esti
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset
+from ballfg.tracks.track import SPIN_LABELS
 from tests.estimation.noise import intervals
 
 
@@ -100,3 +102,22 @@ def test_measurement_effects_are_undone_first(tmp_path):
     found = estimate_noise(model, dataset_surfaces(dataset), settings, dataset, position_known=True, errors=False)
     assert found.noise.acceleration < 0.03
     assert 0.84 < found.held < 0.96
+
+
+def test_noise_of_labels_is_in_their_own_unit(tmp_path):
+    """Labels three times the spins, and as much less certain, are the same measurements."""
+    write_simulation(tmp_path / "shots", SimulationConfig(8, 100.0, seed=3))
+    dataset = read_dataset(tmp_path / "shots")
+    model = load_model(tmp_path / "shots" / "model.yaml")
+    settings = dataset_settings(dataset, model)
+    text = (tmp_path / "shots" / "model.yaml").read_text()
+    (tmp_path / "tripled.yaml").write_text(text.replace("measurement: {}", "measurement: {spin_label_scale: {s: 2.0}}"))
+    tripled = load_model(tmp_path / "tripled.yaml")
+    labels = [track.labels | {name: 3.0 * track.labels[name] for name in SPIN_LABELS} for track in dataset]
+    large = [replace(track, labels=own) for track, own in zip(dataset, labels, strict=True)]
+    wide = replace(settings, spin_label_noise=3.0 * settings.spin_label_noise)
+    surfaces = dataset_surfaces(dataset)
+    one = estimate_noise(model, surfaces, settings, dataset, errors=False)
+    other = estimate_noise(tripled, surfaces, wide, large, errors=False)
+    assert other.noise.spin_label == pytest.approx(3.0 * one.noise.spin_label, rel=0.02)
+    assert other.noise.acceleration == pytest.approx(one.noise.acceleration, rel=0.02)
