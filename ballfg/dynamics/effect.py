@@ -281,6 +281,16 @@ class Effect(nn.Module, ABC):
             listed[name] = replace(listed[name], sigma=sigma)
         self.__dict__["coefficients"] = tuple(listed.values())
 
+    def vary(self, **sigmas: float) -> None:
+        """`set_sigmas` of coefficients that differ so much from ball to ball that each track has its own.
+
+        Raises: KeyError: if it has no coefficient of that name.
+        """
+        self.set_sigmas(**sigmas)
+        self.__dict__["coefficients"] = tuple(
+            replace(c, varies=True) if c.name in sigmas else c for c in self.coefficients
+        )
+
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
         """Values of the shape coefficients at which a search looks for the effect in data that span `scene`.

@@ -21,6 +21,8 @@ GUESSED_BOUNCE: Final = {"restitution": {"e": 0.75}, "friction": {"mu": 0.4}, "t
 """Between those of table-tennis, tennis and rubber balls on hard ground."""
 WIDE: Final = {"drag": 0.5, "magnus": 0.6, "restitution": 0.2, "friction": 0.5, "tangential_restitution": 2.0}
 """Prior standard deviation of a guessed coefficient, as a share of its value."""
+TAKEN_UP: Final = frozenset({"magnus"})
+"""Effects whose spread no track has for its own: flights show the product of the Magnus coefficient and the spin."""
 
 
 def nominal_model(ball: Ball | float | str = TABLE_TENNIS) -> AnalyticModel:
@@ -106,12 +108,13 @@ def _guessed_model(ball: Ball) -> AnalyticModel:
 
 
 def _set_spread(model: AnalyticModel, shares: Mapping[str, float]) -> None:
-    """Give the one coefficient of some effects a prior standard deviation that is a share of its value."""
+    """Let the one coefficient of some effects vary, with a prior standard deviation that is a share of its value."""
     effects = {name: effect for group in (model.flight, model.bounce) for name, effect in group.items()}
     for name, share in shares.items():
         effect = cast(Effect, effects[name])
         (coefficient,) = effect.coefficients
-        effect.set_sigmas(**{coefficient.name: share * abs(float(getattr(effect, coefficient.name).detach()))})
+        give = effect.set_sigmas if name in TAKEN_UP else effect.vary
+        give(**{coefficient.name: share * abs(float(getattr(effect, coefficient.name).detach()))})
 
 
 def spread_like(model: AnalyticModel, usual: AnalyticModel) -> None:
@@ -123,4 +126,5 @@ def spread_like(model: AnalyticModel, usual: AnalyticModel) -> None:
             for one in other.coefficients:
                 value, size = (abs(float(getattr(each, one.name).detach())) for each in (effect, other))
                 if one.sigma is not None and size > 0.0:
-                    effect.set_sigmas(**{one.name: one.sigma * value / size})
+                    give = effect.vary if one.varies else effect.set_sigmas
+                    give(**{one.name: one.sigma * value / size})

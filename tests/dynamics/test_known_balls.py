@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
+import ballfg as bf
 from ballfg.dynamics import Surfaces, known_balls, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.known_balls import KNOWN_BALLS, _read_ball, known_ball
 from ballfg.dynamics.motion.integrate import fly
-from ballfg.dynamics.motion.rollout import advance
+from ballfg.dynamics.motion.rollout import advance, rollout
 from ballfg.dynamics.nominal import known_name
 from ballfg.tracks import TABLE_TENNIS, Ball
 from ballfg.tracks.info import TENNIS
@@ -172,3 +173,23 @@ def test_a_ball_is_one_file(tmp_path: Path) -> None:
     files = {file.stem for file in Path(known_balls.__file__).parent.glob("*.yaml")}
     assert files == set(KNOWN_BALLS)
     assert (KNOWN_BALLS["table_tennis"].ball, KNOWN_BALLS["tennis"].ball) == (TABLE_TENNIS, TENNIS)
+
+
+def test_predictions_through_a_bounce_know_how_much_courts_differ() -> None:
+    """A tennis ball that slides through its bounce: what another court's friction changes is within its prediction."""
+    ball = nominal_model("tennis")
+    start = torch.tensor([[0.0, 0.0, 1.4, 22.0, 0.0, -5.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    times = torch.arange(36, dtype=torch.float64) / 120.0
+    seen = rollout(ball, start, times, Surfaces(0.0))[0, :, :3].detach().numpy()
+    estimate = bf.estimate((times[:18].numpy(), seen[:18]), model=ball, surfaces=0.0)
+    later = 0.6
+    told = estimate.last.predict(later, later)
+    assert told.next_contact.time < 0.3
+    far = []
+    for mu in (0.6, 0.6 * 1.15):  # the spread that the file states
+        model = nominal_model("tennis")
+        model.bounce["friction"].mu.data.fill_(mu)
+        stamps = torch.tensor([float(told.times[-1])], dtype=torch.float64)
+        far.append(float(rollout(model, start, stamps, Surfaces(0.0)).detach()[0, 0, 0]))
+    assert far[0] - far[1] > 0.2
+    assert 0.9 * (far[0] - far[1]) < told.sigmas[-1, 0] < 2.0 * (far[0] - far[1])
