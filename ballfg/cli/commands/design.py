@@ -151,7 +151,7 @@ def _stand(
     opened = inputs.open_inputs(dataset, model, effects_file)
     places = combinations({axis: levels[axis] for axis in "xyz"})
     found = where_to_stand(opened.dataset, opened.model, lens, places, noise=noise, jobs=jobs)
-    print(f"{lens.name} at {len(found)} places, best first: median error; strokes seen; of these, uncertain in depth")
+    print(f"{lens.name} at {len(found)} places, best first: median error; samples seen; strokes uncertain in depth")
     for one in found[:SHOWN]:
         place = " ".join(f"{axis}={value:<6g}" for axis, value in zip("xyz", one.place, strict=True))
         error = f"{1e3 * one.sigma:6.0f} mm" if math.isfinite(one.sigma) else "not seen"

@@ -1,7 +1,8 @@
 """Tells where one camera should stand: how well it would know strokes from each of many places.
 
 The strokes are those of a dataset. From each place they are filmed without noise and estimated from these sightings
-alone; the standard deviations of such an estimate are those to expect there, since they hold.
+alone; the standard deviations of such an estimate are those to expect there, since they hold. A sample out of the
+picture counts as one of unbounded error: else the best place would be one that sees a small part of each stroke well.
 """
 
 from collections.abc import Sequence
@@ -34,10 +35,10 @@ class Stand:
 
     Attributes:
         place: (x, y, z) m.
-        sigma: m, median over strokes of the root mean square standard deviation of the ball's place; inf where most
-            are not seen.
-        seen: share of strokes that it sees often enough.
-        uncertain: share of the seen ones whose depth is called uncertain.
+        sigma: m, median over all samples of the standard deviation of the ball's place, in all directions together;
+            inf where most are not seen.
+        seen: share of all samples that it sees, in strokes that it sees often enough.
+        uncertain: share of these strokes whose depth is called uncertain.
     """
 
     place: tuple[float, float, float]
@@ -70,7 +71,7 @@ def where_to_stand(
     target = np.median(np.concatenate([one.states[:, POSITION] for one in flown]), axis=0)
     asked = [partial(_stand, place, _turned(lens, place, target), flown, model, surfaces, noise) for place in places]
     stands = do_all(asked, jobs)
-    return sorted(stands, key=lambda one: one.sigma)
+    return sorted(stands, key=lambda one: (one.sigma, -one.seen))
 
 
 def _turned(lens: Camera, place: Array, target: Array) -> Camera:
@@ -83,17 +84,17 @@ def _stand(
     place: Array, camera: Camera, flown: Sequence[Estimate], model: BallModel, surfaces: Surfaces, noise: float
 ) -> Stand:
     """What a camera at a place tells of strokes."""
-    smoother, sigmas, uncertain = Smoother(model, surfaces, Settings.for_measured(model)), list[float](), 0
+    smoother, known = Smoother(model, surfaces, Settings.for_measured(model)), list[Estimate]()
     for one in flown:
         found = _seen(smoother, camera, one, noise)
-        if found is not None:
-            uncertain += found.status is Status.DEPTH_UNCERTAIN
-            spread = np.trace(found.covariances[:, POSITION, POSITION], axis1=1, axis2=2)
-            sigmas.append(float(np.sqrt(spread.mean())))
-    every = np.append(sigmas, np.full(len(flown) - len(sigmas), np.inf))
+        known += [] if found is None else [found]
+    sigmas, seen = np.full(sum(map(len, flown)), np.inf), sum(map(len, known))
+    if known:
+        covariances = np.concatenate([one.covariances[:, POSITION, POSITION] for one in known])
+        sigmas[:seen] = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+    uncertain = sum(one.status is Status.DEPTH_UNCERTAIN for one in known) / max(len(known), 1)
     x, y, z = place.tolist()
-    seen = len(sigmas) / len(flown)
-    return Stand((x, y, z), float(np.median(every)), seen, uncertain / len(sigmas) if sigmas else 0.0)
+    return Stand((x, y, z), float(np.median(sigmas)), seen / len(sigmas), uncertain)
 
 
 def _seen(smoother: Smoother, camera: Camera, flown: Estimate, noise: float) -> Estimate | None:

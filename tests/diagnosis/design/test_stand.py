@@ -80,6 +80,22 @@ def test_a_camera_should_stand_high_and_see_the_strokes(data: Dataset) -> None:
     assert (stand.sigma, stand.seen, stand.uncertain) == (np.inf, 0.0, 0.0)
 
 
+def test_a_picture_of_a_part_of_the_strokes_is_not_the_best_one(data: Dataset) -> None:
+    """A part of a picture holds fewer sightings of the same noise: it tells no more of the strokes than all of it."""
+    near, found = np.array((0.0, -1.2, TABLE + 1.2)), []
+    middle = np.median(np.concatenate([path_of(stroke)[1] for stroke in drawn()]), axis=0)
+    for size in ((4000, 4000), (1280, 720)):
+        camera = looking_at("phone", near, middle, 1100.0, size)
+        (stand,) = where_to_stand(data, MODEL, camera, near[None], noise=NOISE)
+        pixels = camera.project(np.concatenate([path_of(stroke)[1] for stroke in drawn()]))
+        share = ((pixels > 0) & (pixels < np.array(size) - 1)).all(axis=1).mean()
+        assert abs(stand.seen - share) < 0.02
+        found.append(stand)
+    assert found[0].seen == 1.0
+    assert found[1].seen < 0.7
+    assert found[1].sigma > found[0].sigma
+
+
 def test_places_that_are_none_are_refused(data: Dataset) -> None:
     for places in (np.zeros(3), np.zeros((0, 3))):
         with pytest.raises(ValueError, match="places must have shape"):
