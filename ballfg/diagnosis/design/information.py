@@ -28,7 +28,7 @@ class View:
 
     Attributes:
         low, high: (3,) m, corners of the box in which the ball is visible. It is open above: lobs are visible too.
-        duration, interval: s, of the longest flight and between samples.
+        duration, interval: s, of the longest flight, and between usable samples on average: a flight will lose as many.
         sigmas: (3,) m, stated noise of a coordinate.
         labelled: True if the spin at the first sample is measured.
     """
@@ -54,7 +54,7 @@ class View:
             low - margin,
             high + margin,
             float(stretches.ends.max()),
-            float(np.median(steps)),
+            float(np.mean(steps)),
             np.median(sigmas, axis=0),
             bool(stretches.labelled[first].mean() > 0.5),
         )

@@ -95,3 +95,17 @@ def test_a_coefficient_shrinks(tmp_path: Path) -> None:
         separating(fit, [("wind", "wind.x")])
     with pytest.raises(ValueError, match="either between or shrink"):
         design_shots(dataset, model, LEVELS)
+
+
+def test_shots_will_lose_as_many_frames_as_the_tracks_did(tmp_path: Path) -> None:
+    """Information is that of the samples: with 55 % of them an error bar of many shots is 1 / sqrt(0.55) as large."""
+    rng, share, sigmas = np.random.default_rng(6), 0.55, []
+    tracks = shots(GRID[rng.integers(len(GRID), size=8)], 6)
+    kept = [np.append(True, rng.random(len(track) - 1) < share) for track in tracks]
+    fewer = [replace(t, times=t.times[k], positions=t.positions[k]) for t, k in zip(tracks, kept, strict=True)]
+    for name, seen in (("all", tracks), ("fewer", fewer)):
+        dataset = dataset_of(tmp_path / name, seen)
+        levels = parse_levels("topspin=0,sidespin=-2..2:2,speed=10")
+        plan = design_shots(dataset, nominal_model(dataset.ball), levels, shrink="restitution.e", shots=200)
+        sigmas.append(plan.sigmas[-1, 0])
+    assert sigmas[1] / sigmas[0] == pytest.approx(1 / np.sqrt(share), rel=0.08)
