@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Literal, cast
 
+import torch
 import yaml
 
 from ballfg.checks import shown
@@ -15,6 +16,7 @@ from ballfg.dynamics.model_file import model_to_dict
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.config import SimulationConfig
+from ballfg.simulation.motion import true_model
 from ballfg.simulation.synthetic import SimulatedTrack, dataset_info, simulate
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter, Track, write_dataset
@@ -95,6 +97,14 @@ def truth_content(config: SimulationConfig) -> dict[str, Any]:
     }
 
 
+def _stamps_are_off(config: SimulationConfig) -> bool:
+    """True if written stamps are not the true times: by jitter, or by a measurement effect such as a wrong clock."""
+    times = torch.linspace(0.0, config.ball.launcher.duration, 10, dtype=torch.float64)
+    with torch.no_grad():
+        written = true_model(config.ball.model, config.undeclared).stamps(times)
+    return config.noise.jitter > 0 or not torch.equal(written, times)
+
+
 def _effect_content(effect: Effect) -> dict[str, Any]:
     units = {c.name: c.unit for c in effect.coefficients}
     return {"kind": effect.kind, "sentence": effect.sentence, "values": effect.values(), "units": units}
@@ -102,7 +112,7 @@ def _effect_content(effect: Effect) -> dict[str, Any]:
 
 def _with_truth(tracks: Iterable[SimulatedTrack], table: TableWriter, config: SimulationConfig) -> Iterator[Track]:
     """The measured tracks; each one's truth is written to the table on its way."""
-    with_true_times = config.noise.jitter > 0
+    with_true_times = _stamps_are_off(config)
     for simulated in tracks:
         columns: dict[str, Any] = {"trajectory": simulated.track.name, "t": simulated.track.times}
         if with_true_times:

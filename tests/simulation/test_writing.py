@@ -81,6 +81,18 @@ def test_truth_has_one_row_per_stamp(tmp_path: Path) -> None:
     np.testing.assert_array_equal([float(row["t_true"]) for row in rows], np.concatenate([t.true_times for t in made]))
 
 
+def test_truth_of_a_clock_that_runs_wrong_has_the_true_times(tmp_path: Path) -> None:
+    """Frames are 10 ms apart, their stamps 10.1 ms: the true velocity belongs to the true times."""
+    clock = SimulationConfig(tracks=2, seed=4, undeclared=parse_effects(["time_scale.s=0.01"]))
+    write_simulation(tmp_path / "d", clock)
+    with (tmp_path / "d" / "truth.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["trajectory"] == "000"][:3]
+    t, t_true, x = (np.array([float(row[name]) for row in rows]) for name in ("t", "t_true", "x"))
+    np.testing.assert_allclose(t, [0.0, 0.0101, 0.0202], rtol=1e-12)
+    np.testing.assert_allclose(t_true, [0.0, 0.01, 0.02], rtol=1e-12)
+    assert (x[2] - x[0]) / (t_true[2] - t_true[0]) == pytest.approx(float(rows[1]["vx"]), rel=1e-4)
+
+
 def test_truth_without_jitter_has_one_time(tmp_path: Path) -> None:
     write_simulation(tmp_path / "d", SimulationConfig(tracks=2), "parquet")
     assert pq.read_table(tmp_path / "d" / "truth.parquet").column_names == ["trajectory", "t", *STATE_NAMES]
