@@ -1,8 +1,9 @@
 """Tells where one camera should stand: how well it would know strokes from each of many places.
 
 The strokes are those of a dataset. From each place they are filmed without noise and estimated from these sightings
-alone; the standard deviations of such an estimate are those to expect there, since they hold. A sample out of the
-picture counts as one of unbounded error: else the best place would be one that sees a small part of each stroke well.
+alone; the standard deviations of such an estimate are those to expect there, since they hold. A sample that is
+out of the picture or behind the table counts as one of unbounded error: else the best place would be one that sees a
+small part of each stroke well, or through the table.
 """
 
 from collections.abc import Sequence
@@ -11,8 +12,9 @@ from functools import partial
 from typing import Final
 
 import numpy as np
+import torch
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Mask
 from ballfg.checks import check_array, check_number
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, sighted_track
@@ -100,7 +102,7 @@ def _stand(
 def _seen(smoother: Smoother, camera: Camera, flown: Estimate, noise: float) -> Estimate | None:
     """The estimate of a stroke from what a camera sees of it; None if that is too little."""
     positions = flown.states[:, POSITION]
-    (rows,) = np.nonzero(camera.in_view(positions))
+    (rows,) = np.nonzero(camera.in_view(positions) & ~_hidden(camera, positions, smoother.surfaces))
     if len(rows) < LEAST_SEEN:
         return None
     times, pixels = flown.times[rows], camera.project(positions[rows])
@@ -111,3 +113,12 @@ def _seen(smoother: Smoother, camera: Camera, flown: Estimate, noise: float) -> 
     track = sighted_track(flown.name, seen, [camera], model=model, surfaces=surfaces, bounces=bounces)
     estimate = smoother.estimate(track)
     return estimate if estimate.status in (Status.OK, Status.DEPTH_UNCERTAIN) else None
+
+
+def _hidden(camera: Camera, positions: Array, surfaces: Surfaces) -> Mask:
+    """(n,) True where the table is between a camera and positions (n, 3), the one above it and the other below."""
+    rise, start = positions[:, 2] - surfaces.table_height, camera.centre[2] - surfaces.table_height
+    apart = rise * start < 0.0
+    share = np.where(apart, start, 0.0) / np.where(apart, start - rise, 1.0)
+    crossings = camera.centre + share[:, None] * (positions - camera.centre)
+    return np.asarray(apart & surfaces.over_table(torch.from_numpy(crossings)).numpy())

@@ -96,6 +96,21 @@ def test_a_picture_of_a_part_of_the_strokes_is_not_the_best_one(data: Dataset) -
     assert found[1].sigma > found[0].sigma
 
 
+def test_the_table_hides_strokes_from_a_camera_below_it(data: Dataset) -> None:
+    """From 2 m beside the table and 0.6 m below it a ball over its middle is hidden up to 0.37 m above it."""
+    lens = looking_at("phone", HIGH, (0.0, 0.0, TABLE), 700.0, (1280, 720))
+    below, beside = (0.0, -2.0, TABLE - 0.6), (0.0, -2.0, TABLE + 0.6)
+    found = where_to_stand(data, MODEL, lens, np.array([below, beside]), noise=NOISE)
+    assert [stand.place for stand in found] == [beside, below]
+    points = np.concatenate([path_of(stroke)[1] for stroke in drawn()])
+    up, edges = (points[:, 2] - TABLE) / 0.6, np.array(SURFACES.extent)
+    x, y = points[:, 0] / (1 + up), (points[:, 1] - 2.0 * up) / (1 + up)  # where the rays pass the table's height
+    hidden = (x > edges[0]) & (x < edges[1]) & (y > edges[2]) & (y < edges[3]) & (up > 0)
+    assert hidden.mean() > 0.3
+    assert abs(found[1].seen - (~hidden).mean()) < 0.05
+    assert found[0].seen > 0.95
+
+
 def test_places_that_are_none_are_refused(data: Dataset) -> None:
     for places in (np.zeros(3), np.zeros((0, 3))):
         with pytest.raises(ValueError, match="places must have shape"):
