@@ -89,8 +89,9 @@ class Estimate:
         status: how the estimation ended.
         innovations: whitened innovations by name of the observation, (m, dim) each. For a filter: measured minus
             predicted; for a smoother: measured minus its prediction from all other measurements. Each divided by its
-            standard deviation: standard normal if model and noise are right. NaN for a method without innovations. The
-            observation that locates the ball comes first: "position" (n, 3), or "sighting" (m, 2) in pixels.
+            standard deviation: standard normal if model and noise are right. NaN for a method without innovations
+            and for a measurement that is not used. The observation that locates the ball comes first: "position"
+            (n, 3), or "sighting" (m, 2) in pixels.
         coefficient_names: of the p model parameters that were estimated with the track.
         coefficients: (p,) in their own units.
         coefficient_covariance: (p, p) in the products of those units.

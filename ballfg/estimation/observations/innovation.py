@@ -132,7 +132,7 @@ def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
     As `leave_position_out`, in the units of whitened residuals: with the Jacobian H of a measurement and its share S =
     H P H^T of the information, the other measurements predict it with covariance C = S (1 - S)^-1, at a distance -(r +
     C r); for a robust loss, H and r in S and in the pull are the weighted ones. The covariance of that distance is 1 +
-    C.
+    C. A measurement that says nothing, H = 0, has none: NaN.
 
     Args: rows: the factors, linearised at the minimum.  covariances: of the states there and of the coefficients.
     """
@@ -150,4 +150,5 @@ def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
     others = joint + gain @ left @ gain.swapaxes(-1, -2)
     pull = pulled.swapaxes(-1, -2) @ residual[..., None]
     distance = -rows.residual - (plain @ others @ pull)[..., 0]
-    return whitened(distance, unit + plain @ others @ plain.swapaxes(-1, -2))
+    found = whitened(distance, unit + plain @ others @ plain.swapaxes(-1, -2))
+    return np.where(np.any(plain, axis=(1, 2), keepdims=True)[..., 0], found, np.nan)

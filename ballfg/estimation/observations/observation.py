@@ -219,6 +219,22 @@ class Observation(ABC):
         """
         return np.zeros(0, dtype=np.int64) if self.locates else np.flatnonzero(self.state == sample)
 
+    def beside_contacts(
+        self, batch: FactorBatch, track: Track, spans: Mapping[int, tuple[float, float]]
+    ) -> FactorBatch:
+        """The batch, each factor on a state of its own side of the contacts; those with no time of their own stay.
+
+        Args:
+            batch: of `batch`.  track: of the observation.
+            spans: by the interval of a contact, from when to when, s, the side is not known: of the first sample's
+                side before, of the second one's after it.
+        """
+        return batch
+
+    def left_out(self, batch: FactorBatch) -> int:
+        """Number of measurements that a batch of `beside_contacts` does not use."""
+        return 0
+
     def single_rows(self, batch: FactorBatch) -> Iterator[tuple[int, FactorBatch]]:
         """The measurements one by one, as on a stream: sample, and a batch of one factor on state 0."""
         for row, sample in enumerate(self.state.tolist()):

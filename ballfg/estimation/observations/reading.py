@@ -1,5 +1,6 @@
 """A reading compares an instrument's numbers with one torch function of the ball's state."""
 
+import copy
 from abc import abstractmethod
 from collections.abc import Hashable, Mapping
 from functools import partial
@@ -144,6 +145,29 @@ class Reading(Observation):
     def batch(self, context: Context) -> FactorBatch:
         """One factor a reading."""
         return ReadingFactors(self, context.model)
+
+    def beside_contacts(
+        self, batch: FactorBatch, track: Track, spans: Mapping[int, tuple[float, float]]
+    ) -> FactorBatch:
+        """The batch; readings of an unknown side, or too far from a sample on their own side, get an infinite sigma."""
+        stamps, times = track.times[self.state] + self.delay, track.times
+        interval, at_sample = np.searchsorted(times, stamps, side="right") - 1, self.delay == 0.0
+        state, known = self.state.copy(), np.ones(len(self), dtype=bool)
+        for between, (begin, end) in spans.items():
+            rows = np.flatnonzero((interval == between) & ~at_sample)
+            state[rows] = np.where(stamps[rows] > end, between + 1, between)
+            known &= at_sample | (stamps < begin) | (stamps > end)
+        if ((state == self.state).all() and known.all()) or not isinstance(batch, ReadingFactors):
+            return batch
+        other, delay = copy.copy(batch), stamps - times[state]
+        known &= (state == self.state) | (np.abs(delay) <= FARTHEST)
+        other.variables, other.delay = state[:, None], delay
+        other.sigma = np.where(known[:, None], self.sigma, np.inf)
+        return other
+
+    def left_out(self, batch: FactorBatch) -> int:
+        """Number of readings with an infinite sigma."""
+        return int(np.isinf(batch.sigma).any(axis=1).sum()) if isinstance(batch, ReadingFactors) else 0
 
     def filter_rows(self, sample: int, since: float = -np.inf, until: float = np.inf) -> Index:
         """(k,) index of the readings of a sample, of a span of time about it."""

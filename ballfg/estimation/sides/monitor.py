@@ -97,7 +97,7 @@ def widening_near_contacts(
     if not sides:
         return lacking
     stamps, beyond = (np.array([side[i] for side in sides]) for i in (0, 1))
-    sigmas = _gap_sigmas(states[stamps], covariances[stamps], shared, stamps, [c.height for _, _, c in sides], model)
+    sigmas = gap_sigmas(states[stamps], covariances[stamps], shared, stamps, [c.height for _, _, c in sides], model)
     speeds = np.maximum(np.abs(states[stamps, VZ]), LEAST_SPEED)
     margins = np.array([(c.time - times[k]) * np.sign(b - k) for k, b, c in sides]) * speeds / sigmas
     near = margins < FAR
@@ -110,13 +110,20 @@ def widening_near_contacts(
     return lacking
 
 
-def _gap_sigmas(
-    states: Array, covariances: Array, shared: Shared, stamps: Array, heights: Sequence[float], model: BallModel
+def gap_sigmas(
+    states: Array,
+    covariances: Array,
+    shared: Shared,
+    stamps: Array,
+    heights: Sequence[float],
+    model: BallModel,
+    lags: Array | float = 0.0,
 ) -> Array:
-    """(m,) m, standard deviations of the gaps between balls and surfaces."""
+    """(m,) m, standard deviations of the gaps between balls and surfaces, `lags` s of flight after their stamps."""
     whole = _with_coefficients(states, shared.mean)
     _, slopes = gap_jacobian(model, whole, torch.tensor(heights, dtype=torch.float64))
     own, rest = slopes.numpy()[:, :STATE_DIM], slopes.numpy()[:, STATE_DIM:]
+    own[:, VZ] += lags
     variance = (own[:, None] @ covariances @ own[:, :, None])[:, 0, 0]
     if len(shared.mean):
         variance += np.einsum("mi,ij,mj->m", rest, shared.covariance, rest)

@@ -5,6 +5,7 @@ surface; a hit adds its jump to the process noise. An interval without a link (a
 Every observation of the track gives its factors; the first state of each linked piece gets a prior.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -43,10 +44,15 @@ QUALITY_SIGMA = {Quality.WIDE: 4.0, Quality.SHIFTED: 20.0, Quality.OUTLIER: 200.
 
 @dataclass(frozen=True)
 class Events:
-    """The events of a track: its segmentation, with refined contacts."""
+    """The events of a track: its segmentation, with refined contacts.
+
+    Attributes:
+        spans: s, by the interval of contacts, from when to when they may be; without an entry anywhere in the interval.
+    """
 
     contacts: tuple[Contact, ...]
     segmentation: Segmentation
+    spans: Mapping[int, tuple[float, float]] | None = None
 
 
 def trackwise_model(model: BallModel, settings: Settings) -> BallModel:
@@ -133,7 +139,7 @@ class TrackProblem:
 
     def graph(self, events: Events) -> BallGraph:
         """The factor graph for some events."""
-        batches: list[FactorBatch] = [*self.observed.values(), *self.added]
+        batches: list[FactorBatch] = [*self.beside(events).values(), *self.added]
         batches += self._dynamics.factors(replace(events.segmentation, contacts=events.contacts))
         batches += (*self._launch, *_priors_after_hits(self.track, events.segmentation, self.settings))
         for observation in self.observations:
@@ -149,18 +155,36 @@ class TrackProblem:
             batches.append(prior.coefficient_prior(self.unknowns.means, self.unknowns.sigmas, self.width))
         return BallGraph(tuple(batches))
 
+    def beside(self, events: Events) -> dict[str, FactorBatch]:
+        """The factors of each observation, by its name, on states of their own side of each contact."""
+        anywhere = {c.interval: tuple(self.track.times[c.interval : c.interval + 2].tolist()) for c in events.contacts}
+        spans = anywhere | dict(events.spans or {})
+        return {one.name: one.beside_contacts(self.observed[one.name], self.track, spans) for one in self.observations}
+
+    def notes(self, events: Events) -> tuple[str, ...]:
+        """A note on each observation with measurements that are not used."""
+        beside = self.beside(events)
+        counts = {one: one.left_out(beside[one.name]) for one in self.observations}
+        return tuple(
+            f"{count} of {len(one)} measurements '{one.name}' are not used: they lie too near a contact to know their "
+            "side of it, or too far from the samples on that side"
+            for one, count in counts.items()
+            if count
+        )
+
     def start(self, states: Array) -> Values:
         """Initial values: states (n, 9), the model's own coefficients, unknowns and biases of zero."""
         means = coefficient_means(self.model, self.settings)
         biases = np.zeros((len(states), BIAS_DIM)) if self.biased else None
         return Values(states, np.append(means, np.zeros(len(self.unknowns.names))), biases)
 
-    def innovations(self, values: Values, covariances: Covariances | None) -> dict[str, Array]:
+    def innovations(self, events: Events, values: Values, covariances: Covariances | None) -> dict[str, Array]:
         """Innovations (m, dim) whitened, at a minimum, by name of the observation; NaN without covariances."""
         if covariances is None:
             return {name: np.full((len(batch), batch.dim), np.nan) for name, batch in self.observed.items()}
+        beside = self.beside(events)
         return {
-            one.name: one.innovations(self.context, self.observed[one.name].linearize(values), values, covariances)
+            one.name: one.innovations(self.context, beside[one.name].linearize(values), values, covariances)
             for one in self.observations
         }
 

@@ -22,6 +22,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.segmentation.result import Contact, Segmentation
+from ballfg.estimation.sides.monitor import FAR, LEAST_SPEED, Shared, gap_sigmas
 from ballfg.estimation.smoother.motion import contacts_by_interval
 from ballfg.estimation.smoother.problem import Events, TrackProblem, bridged_positions
 from ballfg.factors.batch import FactorBatch, Values
@@ -29,8 +30,9 @@ from ballfg.factors.correlated_noise import BiasStartFactors
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, model_width
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.launcher import LauncherSpinFactors
+from ballfg.factors.linear.covariance import Covariances, marginal_covariances
 from ballfg.factors.prior import PriorFactors, SpinLabelFactors
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
 ROUGH = 1e-2
@@ -127,6 +129,9 @@ class ContactSearch:
         self._seen[places] = solution
         refined = refined_contacts(times, solution)
         if places_of(refined) == places:
+            sided = self._sided(solution)
+            if sided is not None:
+                return sided
             unseen = () if self._settled else contacts_at_ends(times, solution, ball, self.surfaces)
             if not unseen:  # a contact that only the end of the track suggests must also explain it better
                 gain = np.inf if self._settled is None else self._settled.minimum.error - solution.minimum.error
@@ -136,9 +141,37 @@ class ContactSearch:
             self._settled = solution
             refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))
         if places_of(refined) in self._seen or len(self._seen) == MAX_REFINEMENTS:
-            return None
+            return self._sided(self.best)
         values = move_contacts(solution.minimum.values, times, places, places_of(refined), ball)
         return Events(refined, self.segmentation), values
+
+    def _sided(self, solution: Solution) -> tuple[Events, Values] | None:
+        """The same arrangement with measurements that a solution without them shows to be on one side of a contact."""
+        events, found, observed = solution.events, solution.minimum, self.problem.observed
+        waiting = any(batch is not observed[name] for name, batch in self.problem.beside(events).items())
+        if not waiting or events.spans is not None or found.step is None:
+            return None
+        known = marginal_covariances(found.step.root).definite()
+        return None if known is None else (replace(events, spans=spans_of(self.problem, solution, known)), found.values)
+
+
+def spans_of(problem: TrackProblem, solution: Solution, known: Covariances) -> dict[int, tuple[float, float]]:
+    """From when to when, s, the contacts of each interval may be, by the sigma of their times.
+
+    Args: known: covariances at the solution.
+    """
+    times, values, own = problem.track.times, solution.minimum.values, slice(problem.width)
+    shared = Shared(values.coefficients[own], known.coefficients[own, own], known.cross[:, :STATE_DIM, own])
+    found = {}
+    for interval, met in contacts_by_interval(timed_contacts(times, solution)).items():
+        ends, stamps = [met[0], met[-1]], np.array([interval, interval + 1])
+        lags = np.array([contact.time for contact in ends]) - times[stamps]
+        states, covariances = values.states[stamps], known.states[stamps, :STATE_DIM, :STATE_DIM]
+        sigmas = gap_sigmas(states, covariances, shared, stamps, [c.height for c in ends], problem.ball, lags)
+        speeds = np.abs(states[:, VZ] - STANDARD_GRAVITY * lags)
+        begin, end = FAR * sigmas / np.maximum(speeds, LEAST_SPEED) * [-1.0, 1.0] + times[stamps] + lags
+        found[interval] = (float(begin), float(end))
+    return found
 
 
 def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:

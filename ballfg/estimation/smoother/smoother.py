@@ -306,7 +306,7 @@ class Smoother(Estimator):
             states=values.states,
             covariances=covariances.states[:, :STATE_DIM, :STATE_DIM],
             status=status,
-            innovations=problem.innovations(values, known),
+            innovations=problem.innovations(solution.events, values, known),
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=values.coefficients[own],
             coefficient_covariance=covariances.coefficients[own, own],
@@ -320,7 +320,7 @@ class Smoother(Estimator):
             error=minimum.error,
             iterations=minimum.iterations,
             world=replace(self.world, process=problem.settings.process),
-            notes=self.doubts(track),
+            notes=(*self.doubts(track), *problem.notes(solution.events)),
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         for observation in problem.observations:

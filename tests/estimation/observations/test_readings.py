@@ -7,17 +7,18 @@ import re
 import numpy as np
 import pytest
 import torch
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model, rollout
 from ballfg.estimation import ExtendedKalmanFilter, Online, RadarSpeed, Settings, Smoother, SpinReading
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.observation import Context
-from ballfg.estimation.observations.reading import FARTHEST, Reading
+from ballfg.estimation.observations.reading import FARTHEST, Reading, ReadingFactors
 from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.factors.batch import COEFFICIENTS, Values
 from ballfg.factors.check import check_factor
 from ballfg.factors.graph import LevenbergMarquardt
+from ballfg.factors.loss import Loss
 from ballfg.tracks import Track
 from tests.estimation.observations.flights import (
     NOISE,
@@ -279,6 +280,59 @@ def test_speeds_between_stamps_leave_covariances_honest(sort: type) -> None:
         squares.append((off.swapaxes(1, 2) @ np.linalg.solve(estimate.covariances[:, 3:6, 3:6], off)).ravel())
     assert np.mean(squares) < 3.0  # chi-square with 3 degrees of freedom, of a model that allows for more than there is
     assert np.max(squares) < chi2.isf(1e-4 / np.size(squares), 3)
+
+
+@pytest.mark.parametrize("loss", [RadarSpeed.loss, Loss()], ids=["huber", "squared"])
+def test_a_reading_beside_a_bounce_is_compared_with_the_state_on_its_own_side(
+    loss: Loss, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bounce halves the speed's vertical part: readings of the wrong side lie 25 to 48 sigma off."""
+    monkeypatch.setattr(RadarSpeed, "loss", loss)
+    smoother = Smoother(nominal_model(), TABLE, Settings.for_measured(nominal_model(), position_noise=(0.003,) * 3))
+    found, squares = [], []
+    for seed in range(24):
+        track, truth = bounced_with_a_fast_radar(seed)
+        estimate = smoother.estimate(track)
+        innovations = estimate.innovations["speed"].ravel()
+        left_out, (speeds,) = np.isnan(innovations), track.observations
+        assert isinstance(speeds, RadarSpeed)
+        stamps = (track.times[speeds.state] + speeds.delay)[left_out]
+        bounces = np.array([contact.time for contact in estimate.contacts])
+        assert left_out.sum() <= 2 * len(bounces)  # 5 ms apart, and a bounce is known to 1 ms and better
+        assert not len(stamps) or np.abs(stamps[:, None] - bounces).min(axis=1).max() < 0.006
+        wanted = [f"{left_out.sum()} of {len(speeds)} measurements 'speed' are not used"] * bool(left_out.any())
+        assert [note.split(":")[0] for note in estimate.notes] == wanted
+        found.append(innovations[~left_out])
+        off = (estimate.states - truth)[:, 3:6, None]
+        squares.append((off.swapaxes(1, 2) @ np.linalg.solve(estimate.covariances[:, 3:6, 3:6], off)).ravel())
+    whitened = np.concatenate(found)
+    assert np.abs(whitened).max() < norm.isf(1e-4 / len(whitened))
+    assert 0.9 < np.sqrt(np.mean(whitened**2)) < 1.1
+    assert np.mean(squares) < 3.0
+
+
+def test_readings_beside_a_contact_go_to_the_sample_on_their_side() -> None:
+    """A contact between 32 and 38 ms after the first of three samples; the third interval is too long to cross."""
+    track = Track(np.array([0.0, 0.04, 0.08, 0.2]), np.zeros((4, 3)))
+    stamps = np.array([0.005, 0.03, 0.035, 0.039, 0.04, 0.06, 0.1, 0.12, 0.17])
+    readings = RadarSpeed.at(track, stamps, np.arange(9.0), 0.1)
+    batch = readings.batch(context_of(track))
+    assert isinstance(batch, ReadingFactors)
+    assert readings.beside_contacts(batch, track, {}) is batch
+    found = readings.beside_contacts(batch, track, {0: (0.032, 0.038), 2: (0.09, 0.095)})
+    assert isinstance(found, ReadingFactors)
+    assert found.variables[:, 0].tolist() == [0, 0, 0, 1, 1, 1, 3, 3, 3]
+    kept = np.array([0, 1, 3, 4, 5, 8])
+    assert readings.left_out(found) == 3
+    assert np.isfinite(found.sigma[:, 0]).nonzero()[0].tolist() == kept.tolist()
+    np.testing.assert_allclose(found.delay[kept], [0.005, 0.03, -0.001, 0.0, 0.02, -0.03], atol=1e-12)
+    np.testing.assert_array_equal(found.values, readings.values)
+    unknown = readings.beside_contacts(batch, track, {0: (0.0, 0.04)})
+    assert isinstance(unknown, ReadingFactors)
+    assert np.isfinite(unknown.sigma[:, 0]).tolist() == [False] * 4 + [True] * 5  # a sample's own reading stays
+    rows = unknown.linearize(Values(np.ones((4, 9)), np.zeros(0)))
+    assert not rows.residual[:4].any()
+    assert not rows.jacobians[0][:4].any()
 
 
 def test_a_filter_counts_the_curvature_of_a_measurement() -> None:

@@ -85,7 +85,7 @@ def smoothed(smoother: "Smoother", task: tuple[State, Array, Point]) -> Smoothed
     near = np.flatnonzero(sides.any(axis=(1, 2)))
     # the covariance of its ends stands for the samples beyond them
     around = Covariances(section.padded(known.states), known.coefficients, section.padded(known.cross))
-    found = problem.innovations(section.padded_values(values), around)
+    found = problem.innovations(section.events, section.padded_values(values), around)
     innovations = {one.name: found[one.name][section.owns(np.asarray(one.state))] for one in problem.observations}
     return Smoothed(values, covariances, cross, {int(k): sides[k] for k in near}, innovations, contacts)
 
