@@ -133,8 +133,11 @@ class Reading(Observation):
         return cls.at(track, rows[:, 0], rows[:, 1:-1], rows[:, -1])
 
     def select(self, samples: NDArray[np.bool_]) -> Self:
-        """The readings of some samples."""
-        kept = samples[self.state]
+        """The readings of some samples, without those beyond the ends of a part: a contact may lie between."""
+        kept, found, last = samples[self.state], np.flatnonzero(samples), len(samples) - 1
+        if len(found):
+            kept &= ~((self.delay < 0.0) & (self.state == found[0]) & (self.state > 0))
+            kept &= ~((self.delay > 0.0) & (self.state == found[-1]) & (self.state < last))
         number = np.cumsum(samples) - 1
         return type(self)(number[self.state[kept]], self.values[kept], self.sigma[kept], self.delay[kept])
 

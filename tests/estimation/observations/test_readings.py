@@ -311,6 +311,30 @@ def test_a_reading_beside_a_bounce_is_compared_with_the_state_on_its_own_side(
     assert np.mean(squares) < 3.0
 
 
+def test_a_track_cut_beside_a_bounce_has_no_readings_from_beyond_it() -> None:
+    """The last sample before a bounce, and the first one after it, have readings from the other side of it."""
+    smoother = Smoother(nominal_model(), TABLE, Settings.for_measured(nominal_model(), position_noise=(0.003,) * 3))
+    squares = []
+    for seed in range(8):
+        track, truth = bounced_with_a_fast_radar(seed)
+        k = next(contact.interval for contact in smoother.estimate(track).contacts)
+        for first, last in ((0, k), (k + 1, len(track) - 1)):
+            part = track.between(float(track.times[first]), float(track.times[last]))
+            (speeds,) = part.observations
+            assert isinstance(speeds, RadarSpeed)
+            stamps, (begin, end) = part.times[speeds.state] + speeds.delay, part.times[[0, -1]]
+            assert begin <= stamps.min() < begin + 0.005
+            assert end - 0.005 < stamps.max() <= end
+            if len(part) < 4:
+                continue
+            estimate = smoother.estimate(part)
+            assert np.nanmax(np.abs(estimate.innovations["speed"])) < 5.0
+            beside = -1 if first == 0 else 0
+            off = (estimate.states - truth[first : last + 1])[beside, 3:6]
+            squares.append(off @ np.linalg.solve(estimate.covariances[beside, 3:6, 3:6], off))
+    assert np.sum(squares) < chi2.isf(0.01, 3 * len(squares))
+
+
 def test_readings_beside_a_contact_go_to_the_sample_on_their_side() -> None:
     """A contact between 32 and 38 ms after the first of three samples; the third interval is too long to cross."""
     track = Track(np.array([0.0, 0.04, 0.08, 0.2]), np.zeros((4, 3)))
