@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.estimation.observations.reading import RadarSpeed
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother import smoother as smoother_module
@@ -83,6 +84,22 @@ def test_pieces_find_the_minimum_of_the_whole_track(case):
     found = in_pieces(smoother, track, 500)
     assert found is not None
     assert_same(found, at_once(smoother, track, 500))
+
+
+def test_pieces_leave_out_the_readings_beside_contacts_that_the_whole_track_does():
+    """A reading may be near the edge of what is known of a contact's time, and the two know it a little differently."""
+    smoother, track = Smoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(1000, seed=3, every=4)
+    dt = np.diff(track.times)
+    seen = np.flatnonzero(dt < 0.05)
+    speeds = np.linalg.norm(smoother.estimate(track).states[seen, 3:6], axis=1)
+    track = track.observed(RadarSpeed.at(track, (track.times[:-1] + 0.3 * dt)[seen], speeds, 0.5))
+    found, whole = in_pieces(smoother, track, 500), smoother.estimate(track)
+    assert found is not None
+    left_out, wanted = (np.isnan(one.innovations["speed"][:, 0]) for one in (found, whole))
+    assert 0 < wanted.sum() < len(whole.contacts)
+    assert (left_out != wanted).sum() <= 0.05 * len(whole.contacts)
+    both = ~(left_out | wanted)
+    assert np.abs(found.innovations["speed"][both] - whole.innovations["speed"][both]).max() < 0.1
 
 
 def test_inner_states_follow_the_ends_as_the_whole_problem_says():

@@ -117,7 +117,7 @@ def joined_minimum(smoother: "Smoother", track: Track, length: int | None = None
     events = section.joined(looks, [0, *inner, len(track)])
     cuts = [0, *inner, len(track) - 1]
     states = [
-        section.State(section.section_of(track, events, first, last, MARGIN), one.select(first, last + 1))
+        section.State(section.section_of(track, events, one, first, last, MARGIN), one.select(first, last + 1))
         for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True)
     ]
     found = _search(smoother, states)

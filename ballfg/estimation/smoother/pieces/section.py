@@ -1,7 +1,7 @@
 """A section of a long track has samples, margins on both sides, events, and factors of its own."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -30,6 +30,7 @@ class Section:
         track: the part, with margins on both sides; labels only at the beginning of the track.
         segmentation: the events in the part, with refined contacts.  first, last: index in the part.
         ends: True if the track ends with the section.
+        spans: as of `Events`.
     """
 
     track: Track
@@ -37,11 +38,12 @@ class Section:
     first: int
     last: int
     ends: bool
+    spans: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def events(self) -> Events:
         """The events in the part."""
-        return Events(self.segmentation.contacts, self.segmentation)
+        return Events(self.segmentation.contacts, self.segmentation, self.spans)
 
     def padded(self, array: Array) -> Array:
         """One entry per sample of the part from one per state; the margins repeat those at the ends."""
@@ -140,6 +142,7 @@ class Look:
         moved: True if one of its contacts moved into another interval.
         timed: the contacts with their estimated times, with the same numbering.
         rival: (3,) rad/s, another first spin that explains the part nearly as well, or None.
+        spans: as of `Events`, counted from the track's first sample.
     """
 
     begin: int
@@ -148,6 +151,7 @@ class Look:
     moved: bool
     timed: tuple[Contact, ...]
     rival: Array | None
+    spans: Mapping[int, tuple[float, float]]
 
     @property
     def end(self) -> int:
@@ -183,7 +187,8 @@ def look(smoother: "Smoother", part: tuple[int, Track]) -> Look | None:
     timed = replace(found, contacts=timed_contacts(track.times, solution))
     moved = places_of(found.contacts) != places_of(solution.events.segmentation.contacts)
     events, contacts = shifted(found, begin), shifted(timed, begin).contacts
-    return Look(begin, solution.minimum.values, events, moved, contacts, solution.rival)
+    spans = {interval + begin: span for interval, span in (solution.events.spans or {}).items()}
+    return Look(begin, solution.minimum.values, events, moved, contacts, solution.rival, spans)
 
 
 def cut_between(one: Look, other: Look) -> int:
@@ -228,8 +233,12 @@ def joined(looks: Sequence[Look], cuts: Sequence[int]) -> Segmentation:
     return Segmentation(tuple(contacts), whole(hits), whole(restarts), tuple(rests), whole(quality))
 
 
-def section_of(track: Track, events: Segmentation, first: int, last: int, margin: int) -> Section:
-    """A section from sample `first` to `last`, the first of the next one or the track's last, with margins."""
+def section_of(track: Track, events: Segmentation, one: Look, first: int, last: int, margin: int) -> Section:
+    """A section from sample `first` to `last`, the first of the next one or the track's last, with margins.
+
+    Args: one: the look at its part of the track.
+    """
     begin, end = max(0, first - margin), min(len(track), last + 1 + margin)
     part = part_of(track, begin, end)
-    return Section(part, events_of(events, begin, end), first - begin, last - begin, last == len(track) - 1)
+    spans = {interval - begin: span for interval, span in one.spans.items() if begin <= interval < end - 1}
+    return Section(part, events_of(events, begin, end), first - begin, last - begin, last == len(track) - 1, spans)
