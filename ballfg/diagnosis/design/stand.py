@@ -116,7 +116,9 @@ def _seen(smoother: Smoother, camera: Camera, flown: Estimate, noise: float) -> 
 
 
 def _hidden(camera: Camera, positions: Array, surfaces: Surfaces) -> Mask:
-    """(n,) True where the table is between a camera and positions (n, 3), the one above it and the other below."""
+    """(n,) True where a table with known ends is between a camera and positions (n, 3), one above it and one below."""
+    if surfaces.extent is None:
+        return np.zeros(len(positions), dtype=bool)
     rise, start = positions[:, 2] - surfaces.table_height, camera.centre[2] - surfaces.table_height
     apart = rise * start < 0.0
     share = np.where(apart, start, 0.0) / np.where(apart, start - rise, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.cameras.strokes import MODEL, SURFACES, TABLE, Scattered, drawn_ball, scattered
-from ballfg.diagnosis.design.stand import where_to_stand
+from ballfg.diagnosis.design.stand import _hidden, where_to_stand
 from ballfg.estimation import Settings, Smoother, sighted_track
 from ballfg.simulation.cameras import looking_at
 from ballfg.state import POSITION
@@ -109,6 +110,9 @@ def test_the_table_hides_strokes_from_a_camera_below_it(data: Dataset) -> None:
     assert hidden.mean() > 0.3
     assert abs(found[1].seen - (~hidden).mean()) < 0.05
     assert found[0].seen > 0.95
+    camera = looking_at("phone", below, (0.0, 0.0, TABLE), 700.0, (1280, 720))
+    assert _hidden(camera, points, SURFACES).mean() == pytest.approx(hidden.mean())
+    assert not _hidden(camera, points, replace(SURFACES, extent=None)).any()  # a table whose ends nobody knows
 
 
 def test_places_that_are_none_are_refused(data: Dataset) -> None:
