@@ -24,7 +24,7 @@ from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
 from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
-from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ
+from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
     from ballfg.prediction.state import BallState
@@ -35,6 +35,10 @@ STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is
 SPANS: Final = 6  # Number of parts of the horizon in which a possible ball has a random acceleration each
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
+NEAR: Final = (
+    4.5  # Standard deviations between a crossing and a bounce, within which balls may cross on both sides of it
+)
+HALVINGS: Final = 30  # of the step in which a possible ball crosses a plane
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce
 Carried: TypeAlias = tuple[Propagator, Belief]
 
@@ -198,6 +202,44 @@ class Path:
         chance = (pushes[:, spans], kicks * noise[[3, 3, 2]], off)
         return Scattered.of(belief.model, start, h, chance, surfaces)
 
+    def crossing(self, plane: Plane) -> Crossing | None:
+        """The crossing of a plane by the mean ball; near a bounce with the covariance of all balls about it.
+
+        Some of them then cross the plane before the bounce and others after it.
+        """
+        found = crossing_of(self.carried, plane, self.horizon)
+        if found is None:
+            return None
+        speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
+        about = NEAR * (found.time_sigma + math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed)
+        contact = next_contact(*self.carried, self.horizon + LATER, after=found.time - about)
+        if contact is None or contact.time > found.time + about:
+            return found
+        times, states, met = self._crossings(plane)
+        if len(met) == 0 or (met == met[0]).all():
+            return found
+        off, late = states - found.state, times - (found.time - self.start.time)
+        covariance = off.T @ off / len(off)
+        return replace(found, time_sigma=math.sqrt(float((late**2).mean())), covariance=covariance)
+
+    def _crossings(self, plane: Plane) -> tuple[Array, Array, Array]:
+        """Times (m,) s since the start, states (m, 9) and numbers of bounces (m,) of the balls that cross a plane."""
+        (line, offset), balls = _line_of(plane), self.possible
+        above = balls.states @ line > offset
+        crossed = (above[:, :-1] != above[:, 1:]) & (balls.met[:, :-1] >= plane.after)
+        if plane.direction != "either":
+            crossed &= above[:, :-1] == (plane.direction == "down")
+        rows = np.flatnonzero(crossed.any(axis=1))
+        at = crossed[rows].argmax(axis=1)
+        first, last = balls.states[rows, at], balls.states[rows, at + 1]
+        h = (balls.times[rows, at + 1] - balls.times[rows, at])[:, None]
+        low, high, side = np.zeros_like(h), np.ones_like(h), above[rows, at][:, None]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            before = (_between(first, last, h, middle) @ line > offset)[:, None] == side
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        return balls.times[rows, at] + (low * h)[:, 0], _between(first, last, h, low), balls.met[rows, at]
+
     def probability(self, line: Array, offset: float, direction: str, after: int = 0) -> float:
         """Share of balls whose line (9,) . state goes through an offset in a direction, after a number of bounces."""
         balls = self.possible
@@ -217,8 +259,24 @@ class Path:
 
 def _crossing(path: Path, plane: Plane) -> EventAhead:
     """The crossing of a plane, after its number of bounces."""
+    line, offset = _line_of(plane)
+    return EventAhead(path.crossing(plane), path.probability(line, offset, plane.direction, plane.after))
+
+
+def _line_of(plane: Plane) -> tuple[Array, float]:
+    """Line (9,) and offset of a plane: a ball is on it where line . state is the offset."""
     normal, offset = plane.line
     line = np.zeros(STATE_DIM)
     line[POSITION] = normal
-    found = crossing_of(path.carried, plane, path.horizon)
-    return EventAhead(found, path.probability(line, offset, plane.direction, plane.after))
+    return line, offset
+
+
+def _between(first: Array, last: Array, h: Array, share: Array) -> Array:
+    """(n, 9) states after shares (n, 1) of steps of h (n, 1) s, on the cubics between states (n, 9)."""
+    start, end = h * first[:, VELOCITY], h * last[:, VELOCITY]
+    rise = last[:, POSITION] - first[:, POSITION]
+    bend, twist = 3.0 * rise - 2.0 * start - end, start + end - 2.0 * rise
+    states = first + share * (last - first)
+    states[:, POSITION] = first[:, POSITION] + share * (start + share * (bend + share * twist))
+    states[:, VELOCITY] = (start + share * (2.0 * bend + 3.0 * share * twist)) / h
+    return states

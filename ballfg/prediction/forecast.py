@@ -11,7 +11,7 @@ from ballfg.checks import check_number, check_text
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing, apex
-from ballfg.prediction.event_ahead import Carried, EventAhead, Path, asked_event, contact_ahead, crossing_of, event_on
+from ballfg.prediction.event_ahead import Carried, EventAhead, Path, asked_event, contact_ahead, event_on
 from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.prediction.state import BallState
@@ -85,6 +85,8 @@ class Forecast:
     ) -> Crossing | None:
         """Place and time of the ball's crossing of a plane across one axis.
 
+        Near a bounce the covariance holds the balls that cross before it and those that cross after it.
+
         Args:
             x, y, z: m, the place of the plane on its axis; exactly one of them.
             direction: `up` along the axis, `down` against it, or `either`.
@@ -97,7 +99,7 @@ class Forecast:
             raise ValueError(f"crossing takes exactly one of x, y, z; got {len(given)} of them. Ask for one plane.")
         axis, place = given[0]
         along = (float(axis == 0), float(axis == 1), float(axis == 2))
-        return crossing_of(self._carried, Plane(along, place, direction, after), self.horizon)
+        return self._path.crossing(Plane(along, place, direction, after))
 
     def event(self, asked: Plane | str) -> EventAhead:
         """An event ahead with its probability.

@@ -242,6 +242,37 @@ def test_possible_balls_move_as_every_other_ball_does(world, surfaces):
         assert balls.states[..., 2].min() > 0.01  # no moment lies below the table
 
 
+VAGUE = np.array([0.01, 0.01, 0.02, 0.1, 0.1, 0.1, 20.0, 20.0, 20.0])
+
+
+@pytest.fixture(scope="module")
+def fallen(world):
+    """Times (k,) s and (balls, k, 9) rollouts of falling balls that are known to `VAGUE`."""
+    first = torch.from_numpy(FALLING + VAGUE * np.random.default_rng(3).standard_normal((DRAWS // 5, 9)))
+    times = torch.linspace(0.0005, 0.8, 1600, dtype=torch.float64)
+    return times.numpy(), rollout(world.model, first, times, Surfaces(0.0)).numpy()
+
+
+@pytest.mark.parametrize("plane", ["x=0.5", "x=0.57,up", "x=0.62,up", "x=0.7,up", "z=0.03,up,after=1", "x=1.2"])
+def test_a_crossing_near_a_bounce_holds_the_balls_on_both_sides(world, fallen, plane):
+    """Spreads about the mean ball's crossing against those of rollouts of many balls; far from a bounce too."""
+    ball = BallState(3.0, FALLING, np.diag(VAGUE**2), (), World(world.model, Surfaces(0.0), NEARLY_EXACT))
+    asked, (times, later) = Plane.parse(plane), fallen
+    found = ball.predict(0.8).event(asked).crossing
+    (normal, offset), bounced = asked.line, np.maximum.accumulate(later[..., VZ] > 0.0, axis=1)
+    crosses = (later[..., POSITION] @ normal > offset) & (bounced | (asked.after == 0))
+    at = crosses.argmax(axis=1)
+    some = crosses.any(axis=1) & (at > 0)
+    there, when = later[some, at[some]], times[at[some]] + 3.0
+    shares = bounced[some, at[some]].mean()
+    assert (0.1 < shares < 0.9) == (plane in ("x=0.57,up", "x=0.62,up"))
+    own = np.sqrt(np.diagonal(found.covariance))
+    about = np.sqrt(np.square(there - found.state).mean(axis=0))
+    assert own[[1, 3, 4, 5]] == pytest.approx(about[[1, 3, 4, 5]], rel=0.15)
+    assert own[[0, 2]] == pytest.approx(about[[0, 2]], rel=0.2, abs=1.5e-3)  # rollouts by half a millisecond
+    assert found.time_sigma == pytest.approx(np.sqrt(np.square(when - found.time).mean()), rel=0.15)
+
+
 @pytest.mark.parametrize("mean", [[0.0, 0.0, 9.0, 3.0, 0.5, 1.0, 0.0, 0.0, 0.0], FALLING])
 def test_possible_balls_have_the_noise_of_the_motion(world, mean):
     """In flight, and after a bounce: an exactly known ball is as uncertain as its prediction later."""
