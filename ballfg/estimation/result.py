@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import check_instance
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.prediction.forecast import Forecast
 from ballfg.prediction.state import BallState, World
@@ -182,9 +183,13 @@ class Estimate:
         Unlike `bf.estimate` it takes one side of a contact near the track's end, the one at the values.
 
         Args: graph: from `bf.graph`, with further factors or without.  values: of all variables of the factors.
-        Raises: RuntimeError: GTSAM's, if the factors leave a variable undetermined.
+        Raises:
+            TypeError: another graph, or values that are none of GTSAM's.  ValueError: values without a variable.
+            RuntimeError: GTSAM's, if the factors leave a variable undetermined.
         """
-        return graph.estimate(values)
+        from ballfg.estimation.smoother.track_graph import TrackGraph
+
+        return check_instance("graph", graph, TrackGraph, "Take bf.graph(track).").estimate(values)
 
     @property
     def last(self) -> BallState:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
+from ballfg.checks import check_instance, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.smoother.problem import TrackProblem
@@ -81,8 +81,18 @@ class TrackGraph:
         Its states are the given ones, without a second look at the end of a track near a contact.
 
         Args: values: of all variables of the factors.
-        Raises: RuntimeError: GTSAM's, if the factors leave a variable undetermined.
+        Raises:
+            TypeError: values that are none of GTSAM's.  ValueError: values without a variable, as of another track.
+            RuntimeError: GTSAM's, if the factors leave a variable undetermined.
         """
+        check_instance("values", values, gtsam.Values, "Give the result of an optimizer of the graph.")
+        asked = set(self.factors.keyVector())
+        if lacking := sorted(asked - set(values.keys())):
+            named = ", ".join(map(gtsam.DefaultKeyFormatter, lacking[:3]))
+            raise ValueError(
+                f"values must hold every variable of the graph's {len(asked)}; {len(lacking)} are missing, such as "
+                f"{named}. Give the result of an optimizer of this graph."
+            )
         marginals, point = Marginals(self.factors.linearize(values), values), from_gtsam(values)
         reached = Convergence.CONVERGED if marginals.distance < NEAR else Convergence.TOO_MANY_ITERATIONS
         minimum = Minimum(point, self.factors.error(values), self._solution.minimum.step, reached, 0)

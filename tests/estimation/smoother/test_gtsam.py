@@ -143,6 +143,23 @@ def test_values_that_are_no_minimum_have_a_status() -> None:
     assert bf.Estimate.from_gtsam(graph, graph.values).status is bf.Status.NOT_CONVERGED
 
 
+def test_what_is_no_solution_of_the_graph_is_refused() -> None:
+    first, second = (bf.graph(track, surfaces=TABLE, settings=settings()) for track in shots(2))
+    few = gtsam.Values()
+    for key in first.keys.tolist()[:-2]:
+        few.insert(key, first.values.atVector(key))
+    with pytest.raises(
+        ValueError, match=r"values must hold every variable of the graph's \d+; [23] are missing, such as"
+    ):
+        bf.Estimate.from_gtsam(first, few)
+    with pytest.raises(TypeError, match=r"values must be a Values; got TrackGraph .* Give the result of an optimizer"):
+        bf.Estimate.from_gtsam(first, second)
+    with pytest.raises(
+        TypeError, match=r"graph must be a TrackGraph; got NonlinearFactorGraph .* Take bf.graph\(track\)"
+    ):
+        bf.Estimate.from_gtsam(first.factors, first.values)
+
+
 def sighting(key: int, pixel: np.ndarray) -> gtsam.CustomFactor:
     def error(_: Any, values: gtsam.Values, jacobians: Any) -> np.ndarray:
         by_pose, by_point, by_lens = (np.zeros((2, d), order="F") for d in (6, 3, 5))
