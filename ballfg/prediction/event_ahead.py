@@ -17,6 +17,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
+from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
 from ballfg.dynamics.motion.rollout import is_resting, place_on
 from ballfg.dynamics.surfaces import Surfaces
@@ -35,10 +36,6 @@ STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is
 SPANS: Final = 6  # Number of parts of the horizon in which a possible ball has a random acceleration each
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
-NEAR: Final = (
-    4.5  # Standard deviations between a crossing and a bounce, within which balls may cross on both sides of it
-)
-HALVINGS: Final = 30  # of the step in which a possible ball crosses a plane
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce
 Carried: TypeAlias = tuple[Propagator, Belief]
 
@@ -211,7 +208,7 @@ class Path:
         if found is None:
             return None
         speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
-        about = NEAR * (found.time_sigma + math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed)
+        about = FAR * (found.time_sigma + math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed)
         contact = next_contact(*self.carried, self.horizon + LATER, after=found.time - about)
         if contact is None or contact.time > found.time + about:
             return found
@@ -231,14 +228,8 @@ class Path:
             crossed &= above[:, :-1] == (plane.direction == "down")
         rows = np.flatnonzero(crossed.any(axis=1))
         at = crossed[rows].argmax(axis=1)
-        first, last = balls.states[rows, at], balls.states[rows, at + 1]
-        h = (balls.times[rows, at + 1] - balls.times[rows, at])[:, None]
-        low, high, side = np.zeros_like(h), np.ones_like(h), above[rows, at][:, None]
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            before = (_between(first, last, h, middle) @ line > offset)[:, None] == side
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
-        return balls.times[rows, at] + (low * h)[:, 0], _between(first, last, h, low), balls.met[rows, at]
+        times, states = balls.crossed(rows, at, line[POSITION], offset)
+        return times, states, balls.met[rows, at]
 
     def probability(self, line: Array, offset: float, direction: str, after: int = 0) -> float:
         """Share of balls whose line (9,) . state goes through an offset in a direction, after a number of bounces."""
@@ -269,14 +260,3 @@ def _line_of(plane: Plane) -> tuple[Array, float]:
     line = np.zeros(STATE_DIM)
     line[POSITION] = normal
     return line, offset
-
-
-def _between(first: Array, last: Array, h: Array, share: Array) -> Array:
-    """(n, 9) states after shares (n, 1) of steps of h (n, 1) s, on the cubics between states (n, 9)."""
-    start, end = h * first[:, VELOCITY], h * last[:, VELOCITY]
-    rise = last[:, POSITION] - first[:, POSITION]
-    bend, twist = 3.0 * rise - 2.0 * start - end, start + end - 2.0 * rise
-    states = first + share * (last - first)
-    states[:, POSITION] = first[:, POSITION] + share * (start + share * (bend + share * twist))
-    states[:, VELOCITY] = (start + share * (2.0 * bend + 3.0 * share * twist)) / h
-    return states

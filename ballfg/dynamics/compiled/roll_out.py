@@ -35,8 +35,8 @@ from ballfg.dynamics.compiled.signatures import (
 )
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED, steps_over
 
-NEWTON_STEPS = 30  # Largest number of steps to a contact on a cubic; four are enough
-TIME_TOLERANCE = 1e-9  # of a step, of a contact on a cubic
+NEWTON_STEPS = 30  # Largest number of steps to a plane on a cubic; four are enough
+TIME_TOLERANCE = 1e-9  # of a step, of a crossing on a cubic
 
 
 @machine_code(NOTHING(*GIVEN, *ROLLING, TWO, TWO, ONE, THREE))
@@ -84,35 +84,45 @@ def _push(surface, x, push, h, world):
         x[5] += h * push[2]
 
 
-@machine_code(FLAG(ONE, ONE, REAL, REAL, ONE, ONE))
-def _touches(x, after, z, h, tau, touch):
-    """Whether a centre comes down on a height z (m) on the cubic between two states (9,) h s apart.
+@machine_code(NOTHING(ONE, ONE, REAL, REAL, ONE))
+def _within(x, after, h, t, at):
+    """Writes the state at (9,) after a share t of a step of h s, on the cubic between its ends x and after (9,)."""
+    for i in range(3):
+        rise = after[i] - x[i]
+        bend, twist = 3.0 * rise - h * (2.0 * x[3 + i] + after[3 + i]), h * (x[3 + i] + after[3 + i]) - 2.0 * rise
+        at[i] = x[i] + t * (h * x[3 + i] + t * (bend + t * twist))
+        at[3 + i] = x[3 + i] + t * (2.0 * bend + 3.0 * t * twist) / h
+        at[6 + i] = x[6 + i] + t * (after[6 + i] - x[6 + i])
 
-    Writes: the time tau (1,) s and the state touch (9,) there.
+
+@machine_code(REAL(ONE, ONE, REAL, ONE, REAL, ONE))
+def _crossed(x, after, h, normal, offset, at):
+    """Time (s) in a step of h s at which a ball crosses normal . p = offset (m); its ends (9,) lie on both sides.
+
+    Writes: the state at (9,) there, on the cubic.
     """
-    rise, t = after[2] - x[2], 0.5
-    if not x[2] > z > after[2]:
-        return False
-    bend, twist = 3.0 * rise - h * (2.0 * x[5] + after[5]), h * (x[5] + after[5]) - 2.0 * rise
-    low, high = 0.0, 1.0
+    low, high, t = 0.0, 1.0, 0.5
+    above = normal[0] * x[0] + normal[1] * x[1] + normal[2] * x[2] > offset
     for _ in range(NEWTON_STEPS):
-        above = x[2] - z + t * (h * x[5] + t * (bend + t * twist))
-        low, high = (t, high) if above > 0.0 else (low, t)
-        slope = h * x[5] + t * (2.0 * bend + 3.0 * t * twist)
+        _within(x, after, h, t, at)
+        value = normal[0] * at[0] + normal[1] * at[1] + normal[2] * at[2] - offset
+        slope = h * (normal[0] * at[3] + normal[1] * at[4] + normal[2] * at[5])
+        low, high = (t, high) if (value > 0.0) == above else (low, t)
         sooner = t
-        t -= above / slope
+        t -= value / slope
         if not low <= t <= high:
             t = 0.5 * (low + high)
         if abs(t - sooner) < TIME_TOLERANCE:
             break
-    tau[0] = t * h
-    for i in range(3):
-        rise = after[i] - x[i]
-        bend, twist = 3.0 * rise - h * (2.0 * x[3 + i] + after[3 + i]), h * (x[3 + i] + after[3 + i]) - 2.0 * rise
-        touch[i] = x[i] + t * (h * x[3 + i] + t * (bend + t * twist))
-        touch[3 + i] = x[3 + i] + t * (2.0 * bend + 3.0 * t * twist) / h
-        touch[6 + i] = x[6 + i] + t * (after[6 + i] - x[6 + i])
-    return True
+    _within(x, after, h, t, at)
+    return t * h
+
+
+@machine_code(NOTHING(TWO, TWO, ONE, ONE, REAL, ONE, TWO))
+def crossed_by_all(x, after, h, normal, offset, times, at):
+    """The same for balls x and after (m, 9) in steps of h (m,) s. Writes: times (m,) s and states at (m, 9)."""
+    for r in range(len(x)):
+        times[r] = _crossed(x[r], after[r], h[r], normal, offset, at[r])
 
 
 @machine_code(COUNT(LAWS, LAW, ONE, REAL, ONE, ONE, ONE, TWO))
@@ -169,7 +179,8 @@ def _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful):
         all; doubtful (m,), 1 where a closer look is needed: a ball that may be at rest, or falls to the floor.
     """
     m, n, none, unmoved = len(x), 0, np.empty((len(x), 9, 0)), np.empty((len(x), 3, 0))
-    under, raised, surface = np.empty((m, 3)), np.empty((m, 3)), laws.surface
+    under, raised, surface, up = np.empty((m, 3)), np.empty((m, 3)), laws.surface, np.zeros(3)
+    up[2] = 1.0
     surface.compute(x, surface.c, surface.w, none, surface.ct, under, unmoved)
     surface.compute(after, surface.c, surface.w, none, surface.ct, raised, unmoved)
     for r in range(m):
@@ -178,9 +189,11 @@ def _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful):
         height = level[n] + raised[r, 0] + world[2]
         if doubtful[r] or not (after[r, 5] < 0.0 and after[r, 2] < height):
             continue
-        if not _touches(x[r], after[r], height, h, tau[n:], touch[n]):
+        if not x[r, 2] > height:
             doubtful[r] = 1
-        elif level[n] == world[0] and not over_table(touch[n], world):
+            continue
+        tau[n] = _crossed(x[r], after[r], h, up, height, touch[n])
+        if level[n] == world[0] and not over_table(touch[n], world):
             doubtful[r] = int(gap_of(only(surface, r), after[r], world[1], world[2]) < 0.0)
         else:
             which[n] = r

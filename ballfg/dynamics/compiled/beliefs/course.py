@@ -7,13 +7,13 @@ from typing import Any, Final, Self
 import numpy as np
 import torch
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.beliefs.carry import carry
 from ballfg.dynamics.compiled.beliefs.events import find
 from ballfg.dynamics.compiled.beliefs.mixture import mix
 from ballfg.dynamics.compiled.in_torch import functions_for, raise_errors
 from ballfg.dynamics.compiled.motion import Moving, world_of
-from ballfg.dynamics.compiled.roll_out import scatter
+from ballfg.dynamics.compiled.roll_out import crossed_by_all, scatter
 from ballfg.dynamics.compiled.signatures import GIVEN
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
@@ -172,6 +172,15 @@ class Scattered:
             np.concatenate((first[:, None], states.reshape(*nodes, STATE_DIM)), axis=1),
             np.concatenate((np.zeros((n, 1)), met.reshape(nodes)), axis=1),
         )
+
+    def crossed(self, rows: Index, at: Index, normal: Array, offset: float) -> tuple[Array, Array]:
+        """Times (m,) s since the start and states (m, 9) of balls that cross normal . p = offset (m).
+
+        Args: rows: (m,) balls.  at: (m,) moments before, with the next one on the other side.
+        """
+        h, times, states = self.times[rows, at + 1] - self.times[rows, at], np.empty(len(rows)), self.states[rows, at]
+        crossed_by_all(states.copy(), self.states[rows, at + 1], h, normal, offset, times, states)
+        return self.times[rows, at] + times, states
 
 
 def density_of(noise: Any) -> Array:
