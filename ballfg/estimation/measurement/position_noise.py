@@ -44,7 +44,7 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     """
     blocks, count = list[Array](), 0
     for track in tracks:
-        blocks.append(_window_residuals(track.seconds, track.positions))
+        blocks.append(_window_residuals(track.seconds, track.positions, np.ones_like(track.positions)))
         count += len(blocks[-1])
         if count >= ENOUGH:
             break
@@ -79,13 +79,12 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
     )
 
 
-def _window_residuals(times: Array, positions: Array, sigmas: Array | None = None) -> Array:
-    """(w, 11, 3) m, residuals of the cubic through each window, scaled to the standard deviation of one sample.
+def _window_residuals(times: Array, positions: Array, sigmas: Array) -> Array:
+    """(w, 11, 3) residuals of the cubic through each window, in the standard deviations sigmas (n, 3) of one sample.
 
-    With `sigmas` (n, 3) m, of each sample, they are divided by their own standard deviations: dimensionless.
-
-    A residual of least squares has variance sigma^2 (1 - h) with h the leverage; predicted without its own sample it is
-    larger by 1 / (1 - h), so that r / sqrt(1 - h) standardises either of them.
+    With the projection P = 1 - B B^T a residual r_i has the variance sum_j P_ij^2 sigma_j^2; for equal sigmas that is
+    sigma^2 (1 - h) with h the leverage. Predicted without its own sample it is larger by 1 / (1 - h), so that
+    r / sqrt(1 - h) standardises either of them.
     """
     size = 2 * HALF_WINDOW + 1
     if len(times) < size:
@@ -96,15 +95,11 @@ def _window_residuals(times: Array, positions: Array, sigmas: Array | None = Non
     centre = stamps[:, HALF_WINDOW, None]
     scaled = (stamps - centre) / (stamps[:, -1:] - stamps[:, :1])
     basis, _ = np.linalg.qr(scaled[..., None] ** np.arange(DEGREE + 1))
-    leverage = np.einsum("wij,wij->wi", basis, basis)
-    values = sliding_window_view(positions, size, axis=0)[short].transpose(0, 2, 1)
-    residuals = values - basis @ (basis.transpose(0, 2, 1) @ values)
-    if sigmas is None:
-        left = np.sqrt((1.0 - leverage).clip(min=LEAST_LEFT))  # rounding may take it below zero
-        return np.asarray(residuals / left[..., None])
-    errors = sliding_window_view(sigmas**2, size, axis=0)[short].transpose(0, 2, 1)
-    kept = (np.eye(size) - basis @ basis.transpose(0, 2, 1)) ** 2 @ errors
-    return np.asarray(residuals / np.sqrt(np.maximum(kept, LEAST_LEFT * median(sigmas**2))))
+    left = np.eye(size) - basis @ basis.transpose(0, 2, 1)
+    values, variances = (
+        sliding_window_view(each, size, axis=0)[short].transpose(0, 2, 1) for each in (positions, sigmas**2)
+    )
+    return np.asarray(left @ values / np.sqrt(np.maximum(left**2 @ variances, LEAST_LEFT * median(sigmas**2))))
 
 
 def _robust_sigma(residuals: Array) -> Array:
