@@ -233,26 +233,28 @@ def shaped(
 
     Raises: ValueError: names the batch, the array and the rule.
     """
-    name, count = type(batch).__name__, len(inputs[0])
+    count = len(inputs[0])
     if len(jacobians) != len(inputs):
         raise ValueError(
-            f"{name}.compute must return one Jacobian per variable, {len(inputs)}; got {len(jacobians)}. "
-            "Return a tuple, in the order of variables; GTSAM ends the interpreter where one is left out."
+            f"{type(batch).__name__}.compute must return one Jacobian per variable, {len(inputs)}; got {len(jacobians)}"
+            ". Return a tuple, in the order of variables; GTSAM ends the interpreter where one is left out."
         )
-    expected: list[tuple[str, Array, tuple[int, ...]]] = [("residual", residual, (count, batch.dim))]
-    expected += [(f"Jacobian {i}", block, (count, batch.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)]
-    for label, array, shape in expected:
-        _check_array(f"{name}.compute: {label}", array, shape)
-    return np.ascontiguousarray(residual), tuple(np.ascontiguousarray(block) for block in jacobians)
+    _check_array(batch, "residual", residual, (count, batch.dim))
+    for i, (block, own) in enumerate(zip(jacobians, inputs, strict=True)):
+        _check_array(batch, i, block, (count, batch.dim, own.shape[-1]))
+    return np.ascontiguousarray(residual), tuple([np.ascontiguousarray(block) for block in jacobians])
 
 
-def _check_array(what: str, array: Array, shape: tuple[int, ...]) -> None:
+def _check_array(batch: FactorBatch, label: str | int, array: Array, shape: tuple[int, ...]) -> None:
+    """Refuses another kind, shape or type; label: `residual`, or the number of a Jacobian. Raises: ValueError."""
+    if isinstance(array, np.ndarray) and array.shape == shape and array.dtype == np.float64:
+        return
+    what = f"{type(batch).__name__}.compute: {label if isinstance(label, str) else f'Jacobian {label}'}"
     if not isinstance(array, np.ndarray):
         raise ValueError(f"{what} must be a numpy array of shape {shape}; got {type(array).__name__}")
     if array.shape != shape:
         raise ValueError(f"{what} must have shape {shape}; got {array.shape}")
-    if array.dtype != np.float64:
-        raise ValueError(f"{what} must be float64; got {array.dtype}. Convert the model with .double().")
+    raise ValueError(f"{what} must be float64; got {array.dtype}. Convert the model with .double().")
 
 
 class DiagonalFactors(FactorBatch):

@@ -4,6 +4,7 @@ import copy
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -180,10 +181,6 @@ class _Point:
         self.values, self.linearized, self.error = values, linearized, objective(linearized)
         self.beyond = False
 
-    def cost(self) -> float:
-        """The objective."""
-        return self.error
-
     def moved(self, graph: BallGraph, states: Array, coefficients: Array) -> "_Point":
         """The point after a step, linearised."""
         values = self.values.retract(states, coefficients)
@@ -224,7 +221,7 @@ def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Poin
         return _bent(graph, point, step, whole)
     if gain >= SHORT:  # of a parabola that bends (2 - gain) times as much
         longer = min(1.0 / max(2.0 - gain, np.finfo(float).tiny), LONGEST)
-        return min(whole, point.moved(graph, longer * step.states, longer * step.coefficients), key=_Point.cost)
+        return min(whole, point.moved(graph, longer * step.states, longer * step.coefficients), key=attrgetter("error"))
     return whole
 
 
@@ -241,12 +238,12 @@ def _bent(graph: BallGraph, point: _Point, step: Step, whole: _Point) -> _Point:
     for _ in range(SHARES):
         enough = point.error - WHOLE * share * (2.0 - share) * step.decrease
         if straight.error > enough and np.isfinite(straight.error):
-            best = min(best, _taken_back(graph, point, step, share, straight), key=_Point.cost)
+            best = min(best, _taken_back(graph, point, step, share, straight), key=attrgetter("error"))
         if best.error < enough:
             break
         share *= min(max(share / (2.0 * share - _gain(point, straight, step)), SMALLER[0]), SMALLER[1])
         straight = point.moved(graph, share * step.states, share * step.coefficients)
-        best = min(best, straight, key=_Point.cost)
+        best = min(best, straight, key=attrgetter("error"))
     return best
 
 
