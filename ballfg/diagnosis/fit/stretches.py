@@ -128,9 +128,9 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches
     """The stretches of one track, each as a batch of its own."""
     known = launcher.settings(track)
     settings = np.zeros(len(launcher.embedding.names)) if known is None else known
-    problem = smoother.problem(track)
-    sigma, solution = problem.sigma, smoother.settle(problem)
-    estimate, segmentation = smoother.result(problem, solution), solution.events.segmentation
+    problem, solution = smoother.solved(track)
+    sigma, segmentation = problem.sigma, solution.events.segmentation
+    estimate = smoother.result(problem, solution)
     if estimate.status.failed:
         return []
     rests = [rest.first for rest in segmentation.rests]

@@ -51,6 +51,8 @@ def falls_throughout(times: Array, positions: Array, sigma: Array, physics: Segm
 
     Args: times: (n,) s.  positions: (n, 3) m.  sigma: (3,) m, white noise.  physics: of the ball.
     """
+    if len(times) < LEAST_WINDOW:
+        return True
     step = float(np.median(np.diff(times)))
     size = max(LEAST_WINDOW, round(WINDOW / step) + 1)
     if len(times) < size:

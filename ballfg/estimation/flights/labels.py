@@ -28,7 +28,7 @@ MERGED: Final = 0.15  # s since its last event after which a hypothesis merges w
 LEAST_MERGED: Final = 12  # Samples, likewise, at least
 MOST: Final = 400  # Largest number of hypotheses
 MARGIN: Final = 25.0  # nats. Hypotheses this far behind the best are dropped
-GAP: Final = 0.5  # s. Nothing links the two sides of a longer gap
+GAP: Final = 0.1  # s. Over a longer gap a flight may bounce unseen: each side is explained by itself
 ROLLED: Final = 0.03  # m. A ball that gets less far does not roll
 ALIKE: Final = 0.03  # m. Places within this height of each other are on one surface
 HANDS: Final = 30.0  # nats, by which hands must explain a recording better than flights, strikes and bounces alone
@@ -72,19 +72,17 @@ def label_samples(track: Track, physics: SegmentationPhysics, levels: Sequence[f
     Source: docs/derivations/segmentation.md.
     """
     times, positions, n = track.seconds, track.positions, len(track)
-    whole = Labels(np.zeros(n, np.int8), np.zeros(0, np.int64))
+    values, bounces = np.zeros(n, np.int8), list[int]()
     if track.rough or track.one_view or n < FEWEST:
-        return whole
+        return Labels(values, np.zeros(0, np.int64))
     sigmas = np.maximum(np.tile(scatter(times, positions), (n, 1)), LEAST_SIGMA)
-    if falls_throughout(times, positions, sigmas[0], physics):
-        return whole
-    values, bounces = np.empty(n, np.int8), list[int]()
     edges = [0, *(np.flatnonzero(np.diff(times) > GAP) + 1).tolist(), n]
     for first, stop in pairwise(edges):
         part = slice(first, stop)
-        found = _explained(times[part], positions[part], sigmas[part], physics, levels)
-        values[part] = found.values
-        bounces += (found.bounces + first).tolist()
+        if not falls_throughout(times[part], positions[part], sigmas[0], physics):
+            found = _explained(times[part], positions[part], sigmas[part], physics, levels)
+            values[part] = found.values
+            bounces += (found.bounces + first).tolist()
     return Labels(values, np.array(bounces, dtype=np.int64))
 
 

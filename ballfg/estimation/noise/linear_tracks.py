@@ -121,8 +121,7 @@ def linearise(
 def _piece(smoother: Smoother, track: Track) -> _Piece:
     model = smoother.model.for_track(smoother.settings.grouped(track))
     own = smoother if model is smoother.model else Smoother(model, smoother.surfaces, smoother.settings)
-    problem = own.problem(track)
-    return _linearised(problem, own.settle(problem))
+    return _linearised(*own.solved(track))
 
 
 def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:

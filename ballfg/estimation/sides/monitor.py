@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Final
 
 import numpy as np
@@ -11,8 +12,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import gap_jacobian
-from ballfg.dynamics.motion.integrate import fly
+from ballfg.dynamics.motion.contact import fly_through, gap_jacobian
 from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact
@@ -93,19 +93,18 @@ def widening_near_contacts(
         model: the ball, its coefficients in columns after the state.
     """
     lacking = np.zeros_like(covariances)
-    sides = [(k, c.interval + (k == c.interval), c) for c in contacts for k in (c.interval, c.interval + 1)]
+    grouped = [list(met) for _, met in groupby(contacts, key=lambda contact: contact.interval)]
+    sides = [(met[0].interval + late, met[-late], met) for met in grouped for late in (0, 1)]
     if not sides:
         return lacking
-    stamps, beyond = (np.array([side[i] for side in sides]) for i in (0, 1))
-    sigmas = gap_sigmas(states[stamps], covariances[stamps], shared, stamps, [c.height for _, _, c in sides], model)
+    stamps = np.array([k for k, _, _ in sides])
+    sigmas = gap_sigmas(states[stamps], covariances[stamps], shared, stamps, [c.height for _, c, _ in sides], model)
     speeds = np.maximum(np.abs(states[stamps, VZ]), LEAST_SPEED)
-    margins = np.array([(c.time - times[k]) * np.sign(b - k) for k, b, c in sides]) * speeds / sigmas
-    near = margins < FAR
-    stamps, beyond = stamps[near], beyond[near]
-    carried = _carried(model, states[beyond], shared.mean, times[stamps] - times[beyond])
-    for k, other, there, margin in zip(stamps, beyond, carried, margins[near].tolist(), strict=True):
-        if possible(there):  # back over a long gap, drag accelerates
+    lags = np.array([(c.time - times[k]) * (1 if k == c.interval else -1) for k, c, _ in sides])
+    for (k, _, met), margin in zip(sides, (lags * speeds / sigmas).tolist(), strict=True):
+        if margin < FAR and possible(there := _on_other_side(model, times, states, shared.mean, k, met)):
             chance = 0.5 * math.erfc(max(margin, 0.0) / math.sqrt(2.0))
+            other = 2 * met[0].interval + 1 - k
             lacking[k] += widening(covariances[k], covariances[other], there - states[k], chance)
     return lacking
 
@@ -131,14 +130,22 @@ def gap_sigmas(
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _carried(model: BallModel, states: Array, coefficients: Array, dt: Array) -> Array:
-    """(m, 9) states carried over dt (m,) s of free flight each: the other side's motion, at this side's stamp."""
-    after = np.empty_like(states)
+def _on_other_side(
+    model: BallModel, times: Array, states: Array, coefficients: Array, stamp: int, met: Sequence[Contact]
+) -> Array:
+    """(9,) the state at a stamp if the nearest contact of its interval lay beyond it; NaN or absurd where none fits.
+
+    Args: met: contacts of one interval, which begins or ends with the stamp.
+    """
+    first, heights = met[0].interval, [contact.height for contact in met]
+    start, dt = first, times[stamp] - times[first]
+    if stamp == first and len(met) == 1:
+        start, dt = first + 1, times[first] - times[first + 1]
+    passed = heights[:1] if start == stamp else heights[:-1]
+    state = _with_coefficients(states[start : start + 1], coefficients)
     with torch.no_grad():
-        for i in range(len(states)):  # one by one: balls that fly together share their number of integration steps
-            one = _with_coefficients(states[i : i + 1], coefficients)
-            after[i] = fly(model, one, torch.from_numpy(dt[i : i + 1]))[0, :STATE_DIM]
-    return after
+        after, _ = fly_through(model, state, torch.tensor([dt]), tuple(passed))
+    return after[0, :STATE_DIM].numpy()
 
 
 def _with_coefficients(states: Array, coefficients: Array) -> torch.Tensor:

@@ -11,6 +11,7 @@ search starts again; the lower minimum is the result.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -64,6 +65,16 @@ class Solution:
     minimum: Minimum
     rival: Array | None = None
     """(3,) rad/s, first spin of another minimum that is nearly as low, if any."""
+    others: tuple["Other", ...] = ()
+    """With other numbers of contacts in gaps, nearly as probable."""
+
+
+class Other(NamedTuple):
+    """A solution of another problem of the same track; odds: log, of the solution that it is compared with."""
+
+    problem: TrackProblem
+    solution: Solution
+    odds: float
 
 
 @dataclass(frozen=True)

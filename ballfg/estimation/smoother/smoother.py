@@ -18,13 +18,14 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Segmentation
+from ballfg.estimation.segmentation.segmenter import USUAL
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.sides.monitor import widened_near_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import (
     Solved,
     from_before_a_bounce,
-    log_odds,
+    log_evidence,
     with_both_sides,
     with_other_beginning,
 )
@@ -113,6 +114,7 @@ class Smoother(Estimator):
         for _ in range(OFFSET_ROUNDS):
             problem, *rivals = smoother.problems(track.since_first())
             problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
+            problem, solution = smoother.bridged(problem, solution)
             found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
@@ -139,21 +141,23 @@ class Smoother(Estimator):
         calm = replace(self.settings, find_events=False)
         return Smoother(self.model, self.surfaces, calm, replace(self.optimizer, max_iterations=FIRST_STEPS))
 
-    def segment(self, track: Track) -> Segmentation:
-        """The events in a track."""
-        return self._segmented(track)[0]
+    def segment(self, track: Track, longest_gap: float = USUAL.longest_gap) -> Segmentation:
+        """The events in a track; longest_gap: s, from which on the two sides are explained by themselves."""
+        return self._segmented(track, longest_gap)[0]
 
-    def _segmented(self, track: Track) -> tuple[Segmentation, tuple[LowHops, ...]]:
+    def _segmented(
+        self, track: Track, longest_gap: float = USUAL.longest_gap
+    ) -> tuple[Segmentation, tuple[LowHops, ...]]:
         """The events in a track, and the compatible low hops."""
         for observation in track.observations:
             shown = observation.segmentation()
             if shown is not None:
                 return shown, ()
-        settings = self.settings.for_track(track)
+        settings, prices = self.settings.for_track(track), replace(USUAL, longest_gap=longest_gap)
         white = sample_sigmas(settings, len(track), track.sigmas)
         sigma = total_sigmas(settings, white, partial(window_velocities, track.times, track.positions))
-        physics = physics_of(self.model)
-        found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
+        ball, surfaces = physics_of(self.model), self.surfaces
+        found = segment(track.times, track.positions, sigma, surfaces=surfaces, physics=ball, settings=prices)
         found = found if self.settings.find_events else found.only_contacts()
         hops = self.low_hops(track, found)
         return counted(found, hops, track.times), hops
@@ -175,7 +179,15 @@ class Smoother(Estimator):
         Args: track: prepared, with stamps since its first.
         """
         problem, *rivals = self.problems(track)
-        return self.lowest(problem, self.settle(problem), rivals)
+        return self.bridged(*self.lowest(problem, self.settle(problem), rivals))
+
+    def bridged(self, problem: TrackProblem, solution: Solution) -> Solved:
+        """The problem and its solution, or those with a more probable number of contacts in gaps between samples."""
+        if np.diff(problem.track.times).max(initial=0.0) <= USUAL.short_gap:
+            return problem, solution
+        from ballfg.estimation.smoother.second_look.gaps import bridged  # few tracks have gaps
+
+        return bridged(self, problem, solution)
 
     def lowest(
         self, problem: TrackProblem, solution: Solution, rivals: Iterable[TrackProblem]
@@ -264,7 +276,7 @@ class Smoother(Estimator):
         Args: begins: True if the first state is the track's, False if earlier samples are known.
         """
         rival: Solved | None = from_before_a_bounce(self, problem, solution) if begins else None
-        odds = np.inf if rival is None else log_odds(solution, rival[1])
+        odds = np.inf if rival is None else log_evidence(solution) - log_evidence(rival[1])
         if rival is not None and odds < 0.0:
             (problem, solution), rival, odds = rival, (problem, solution), -odds
         known = self.optimizer.covariances(solution.graph, solution.minimum)
@@ -272,6 +284,11 @@ class Smoother(Estimator):
         if rival is not None:
             other = self.at_minimum(*rival, self.optimizer.covariances(rival[1].graph, rival[1].minimum))
             estimate = with_other_beginning(estimate, other, odds)
+        for one in solution.others:
+            from ballfg.estimation.smoother.second_look.gaps import with_other_contacts
+
+            known = self.optimizer.covariances(one.solution.graph, one.solution.minimum)
+            estimate = with_other_contacts(estimate, self.at_minimum(one.problem, one.solution, known), one.odds)
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
             return estimate
         estimate = with_both_sides(self, problem, estimate)

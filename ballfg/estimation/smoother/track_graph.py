@@ -59,8 +59,7 @@ class TrackGraph:
         Raises: ValueError: a track without a graph, or as `Estimator.estimate`.
         """
         prepared = smoother.prepared(track)
-        problem, *rivals = smoother.problems(prepared.since_first())
-        problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
+        problem, solution = smoother.solved(prepared.since_first())
         if solution.minimum.step is None:
             raise ValueError(f"track {shown(track.name)}: {Status.FAILED.value}")
         return cls(

@@ -55,6 +55,25 @@ def test_a_table_of_uncertain_height_puts_more_stamps_in_doubt() -> None:
     assert beside(4e-4)[1][0, 5, 5] > 1.02 * beside(1e-9)[1][0, 5, 5]
 
 
+def test_over_a_gap_with_two_contacts_the_other_side_has_the_first_one_only() -> None:
+    """The ball bounces twice between two stamps, the second time just before the later one."""
+    fast, hop = 3.0, 2.0 * E * 3.0 / G
+    begin = 0.1  # s, of the fall before the first contact
+    times = np.array([0.0, begin + hop + EARLY])
+    made = np.zeros((2, 9))
+    made[0, 2], made[0, 5] = (fast - G * begin) * begin + G * begin**2 / 2, -(fast - G * begin)
+    made[1, 2], made[1, 5] = E * E * fast * EARLY, E * E * fast - G * EARLY
+    made[:, 2] += MODEL.radius
+    contacts = (Contact(0, begin, 0.0), Contact(0, begin + hop, 0.0))
+    nothing = Shared(np.zeros(0), np.zeros((0, 0)), np.zeros((2, 9, 0)))
+    lacking = widening_near_contacts(times, made, np.tile(SIGMA**2 * np.eye(9), (2, 1, 1)), contacts, MODEL, nothing)
+    chance = norm.sf(EARLY * made[1, 5] / SIGMA)
+    share = max(chance, min(MORE * chance, ENOUGH))
+    jump = -E * fast - G * EARLY - made[1, 5]
+    assert lacking[1, 5, 5] == pytest.approx(share * jump**2, rel=1e-6)
+    assert not lacking[0].any()
+
+
 def test_a_covariance_that_covers_is_never_less_than_either() -> None:
     """In no direction is it less certain of itself than the near side, nor, once in doubt, than the far side."""
     rng = np.random.default_rng(4)

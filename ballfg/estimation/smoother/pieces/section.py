@@ -180,7 +180,8 @@ def bounds_of(samples: int, length: int, overlap: int) -> list[tuple[int, int]]:
 def look(smoother: "Smoother", part: tuple[int, Track]) -> Look | None:
     """The events and states of a part, given with its first sample's number; None without a finite explanation."""
     begin, track = part
-    solution = smoother.settle(smoother.problem(track))
+    problem = smoother.problem(track)
+    _, solution = smoother.bridged(problem, smoother.settle(problem))
     if solution.minimum.step is None:
         return None
     found = replace(solution.events.segmentation, contacts=solution.events.contacts)

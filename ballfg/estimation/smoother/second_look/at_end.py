@@ -169,14 +169,11 @@ def _sigma_at_start(smoother: "Smoother", problem: TrackProblem, solution: Solut
     return float(np.sqrt(slope @ known.joint(0)[np.ix_(order, order)] @ slope))
 
 
-def log_odds(solution: Solution, other: Solution) -> float:
-    """nats, by which one solution is more probable than another: of their evidence in Laplace's approximation."""
-    cost = []
-    for one in (solution, other):
-        assert one.minimum.step is not None
-        spread = sum(batch.log_spread() for batch in one.graph.batches if len(batch))
-        cost.append(one.minimum.error + one.minimum.step.root.log_determinant + spread)
-    return cost[1] - cost[0]
+def log_evidence(solution: Solution) -> float:
+    """nats, in Laplace's approximation, but for a constant of the track."""
+    assert solution.minimum.step is not None
+    spread = sum(batch.log_spread() for batch in solution.graph.batches if len(batch))
+    return -(solution.minimum.error + solution.minimum.step.root.log_determinant + spread)
 
 
 def with_other_beginning(estimate: Estimate, other: Estimate, odds: float) -> Estimate:

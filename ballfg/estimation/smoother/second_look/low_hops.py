@@ -101,23 +101,24 @@ def low_hops(
     """The stretches of a track in which the ball hops low.
 
     A ball in flight stays below a height no longer than a hop of that height takes: if samples stay there longer, it
-    hops or lies still. Hits, gaps and the ends of rests end stretches.
+    hops or lies still. Hits, the ends of rests and intervals as long as such a hop end stretches.
     """
     if len(track) < 2:
         return ()
     sigma, ball, found = _height_sigmas(track, settings), _Ball(model, settings), list[LowHops]()
     most = max(LOWEST, LOW * float(median(sigma)))
+    unseen = np.diff(track.times) > _hop(most, ball.gravity(track.positions[0]))
     for number, height in enumerate(surfaces.heights()):
         gap = ball.gap(track.positions, height)
         low = np.abs(gap) < most
         if number == 0:
             low &= surfaces.over_table(torch.from_numpy(track.positions)).numpy()
-        for first, last in _runs(low, events):
+        for first, last in _runs(low, events, unseen):
             if first == last:
                 continue
             position, inside = track.positions[first], slice(first, last + 1)
             gravity = ball.gravity(position)
-            if gravity <= 0.0 or track.times[last] - track.times[first] <= 2.0 * np.sqrt(2.0 * most / gravity):
+            if track.times[last] - track.times[first] <= _hop(most, gravity):
                 continue
             law = ball.law(position, most, gravity)
             phases = int(np.clip(4.0 * most / np.median(sigma[inside]), LEAST_PHASES, MOST_PHASES))
@@ -128,6 +129,11 @@ def low_hops(
             least = float(np.sqrt(2.0 * law.gravity * np.median(sigma[inside])))
             found.append(LowHops(first, height, track.positions[inside, Z] - gap[inside], least, known))
     return tuple(found)
+
+
+def _hop(height: float, gravity: float) -> float:
+    """s, duration of a hop to a height in m; infinite for a ball that does not come down."""
+    return 2.0 * float(np.sqrt(2.0 * height / gravity)) if gravity > 0.0 else np.inf
 
 
 def counted(events: Segmentation, hops: Sequence[LowHops], times: Array) -> Segmentation:
@@ -251,11 +257,12 @@ def _height_sigmas(track: Track, settings: Settings) -> Array:
     return np.asarray(np.sqrt(white**2 + settings.memory[2] ** 2 * (1.0 + fading) / (1.0 - fading)))
 
 
-def _runs(low: NDArray[np.bool_], events: Segmentation) -> list[tuple[int, int]]:
-    """First and last samples of runs of low samples without a hit, a gap or an end of a rest."""
+def _runs(low: NDArray[np.bool_], events: Segmentation, unseen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last samples of runs of low samples without a hit, a gap, an end of a rest or an unseen interval."""
     ends = [rest.last + 1 for rest in events.rests]
     broken = np.zeros(len(low) + 1, dtype=bool)
-    broken[np.array([*events.hits.tolist(), *events.restarts.tolist(), *ends], dtype=np.int64) + 1] = True
+    gaps_between = [*events.hits.tolist(), *events.restarts.tolist(), *np.flatnonzero(unseen).tolist()]
+    broken[np.array([*gaps_between, *ends], dtype=np.int64) + 1] = True
     starts = low & ~np.concatenate(([False], low[:-1])) | low & broken[:-1]
     stops = low & ~np.concatenate((low[1:], [False])) | low & broken[1:]
     return list(zip(np.flatnonzero(starts).tolist(), np.flatnonzero(stops).tolist(), strict=True))

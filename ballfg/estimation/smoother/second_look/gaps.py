@@ -1,0 +1,226 @@
+"""Asks how often a ball has bounced in a gap between two samples, where no sample shows it.
+
+The segmentation tries a bounce where its mean path meets a surface. Over a gap the path is known to decimetres, so that
+the ball may have bounced more or less often; a wrong number looks like noise, spin or events of the samples beside the
+gap. So the samples near a gap are explained again, each side by itself, with other numbers of bounces between them.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics.motion.contact import fly_through
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.result import Estimate
+from ballfg.estimation.segmentation.explain import rarity
+from ballfg.estimation.segmentation.result import Contact, Segmentation
+from ballfg.estimation.segmentation.segmenter import USUAL
+from ballfg.estimation.sides.monitor import widening
+from ballfg.estimation.smoother.pieces.section import shifted
+from ballfg.estimation.smoother.problem import TrackProblem
+from ballfg.estimation.smoother.second_look.at_end import CERTAIN, Solved, log_evidence
+from ballfg.estimation.smoother.settle import Other, Solution
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.state import Z
+from ballfg.tracks import Track
+
+MANY_STEPS: Final = 3.0
+"""Least length of a gap over the usual step. Where all steps are so long, samples show too little between them."""
+REACH: Final = 0.3
+"""s, on each side of a gap: these samples show the motion at its ends, whatever was before and after them."""
+MOST: Final = 8
+"""Largest number of contacts that the motion before a gap may foretell."""
+APART: Final = -math.log(CERTAIN)
+"""nats, by which an explanation is so much less probable than another one that it is left out."""
+
+
+def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> Solved:
+    """The most probable of a track's solutions with other numbers of contacts in its gaps.
+
+    Args: problem, solution: with the events that the whole track shows.
+    Returns: a problem and its solution, whose `others` are nearly as probable.
+    """
+    others = list[Solved]()
+    for gap in _gaps(problem.track, solution.events.segmentation):
+        begin, near = _beside(problem.track, gap)
+        local = _Local(smoother, near, gap - begin)
+        counts = _inside(solution.events.contacts, gap), _foretold(smoother, problem, solution, gap)
+        for events in local.likely(*counts):
+            known = replace(solution.events.segmentation, contacts=solution.events.contacts)
+            if _alike(known, spliced := _spliced(known, shifted(events, begin), begin, gap), gap):
+                continue
+            other = smoother.problem(problem.track, spliced)
+            other.added += problem.added
+            found = smoother.settle(other)
+            if _evidence(other, found) > _evidence(problem, solution):
+                (problem, solution), (other, found) = (other, found), (problem, solution)
+            others.append((other, found))
+    best = _evidence(problem, solution)
+    rivals = (Other(*other, best - _evidence(*other)) for other in others)
+    return problem, replace(solution, others=tuple(one for one in rivals if one.odds < APART))
+
+
+def _gaps(track: Track, events: Segmentation) -> list[int]:
+    """The intervals without samples in which a ball may have bounced unseen.
+
+    They are longer than those over which the segmentation follows hits, but not so long that nothing links their sides.
+    Observations that state their own events state those in gaps, too.
+    """
+    if any(observation.segmentation() is not None for observation in track.observations):
+        return []
+    steps = np.diff(track.times)
+    long = steps > max(USUAL.short_gap, MANY_STEPS * float(np.median(steps)))
+    long[events.restarts] = False
+    for rest in events.rests:
+        long[rest.first : rest.last + 1] = False
+    return [int(interval) for interval in np.flatnonzero(long)]
+
+
+def _beside(track: Track, gap: int) -> tuple[int, Track]:
+    """The number of the first sample near a gap, and the part of the track near it."""
+    start, end = track.times[gap] - REACH, track.times[gap + 1] + REACH
+    return int(np.searchsorted(track.times, start)), track.between(start, end)
+
+
+@dataclass
+class _Local:
+    """The samples near a gap, explained with some numbers of contacts in it, each with its evidence in nats."""
+
+    smoother: Smoother
+    track: Track
+    gap: int
+    explained: dict[int, tuple[float, Segmentation]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.apart = self.smoother.segment(self.track, USUAL.short_gap)
+        calm = replace(self.smoother.settings, find_events=False)  # a wrong number would ask for hits
+        self.calm = Smoother(self.smoother.model, self.smoother.surfaces, calm, self.smoother.optimizer)
+
+    def likely(self, *counts: int) -> Iterator[Segmentation]:
+        """The events of the most probable explanation, then of those that are nearly as probable.
+
+        Numbers of contacts grow and fall from given ones as long as that is more probable.
+        """
+        for count in counts:
+            for change in (1, -1):
+                best = count
+                while best + change >= 0 and self._evidence(best + change) > self._evidence(best):
+                    best += change
+        ranked = sorted(self.explained.values(), key=lambda known: -known[0])
+        yield from (events for evidence, events in ranked if evidence > ranked[0][0] - APART)
+
+    def _evidence(self, count: int) -> float:
+        if count not in self.explained:
+            problem = self.calm.problem(
+                self.track, _with_contacts(self.apart, self.track, self.smoother.surfaces, self.gap, count)
+            )
+            solution = self.calm.settle(problem)
+            events = replace(solution.events.segmentation, contacts=solution.events.contacts)
+            self.explained[count] = _evidence(problem, solution), events
+        return self.explained[count][0]
+
+
+def _with_contacts(apart: Segmentation, track: Track, surfaces: Surfaces, gap: int, count: int) -> Segmentation:
+    """Events whose gap is linked, with contacts evenly over it: they move to where they belong."""
+    parts = (np.arange(count) + 0.5) / max(count, 1)
+    times = track.times[gap] + parts * (track.times[gap + 1] - track.times[gap])
+    below = zip(times.tolist(), _heights_below(surfaces, track, gap, parts), strict=True)
+    contacts = [Contact(gap, time, height) for time, height in below if height > -math.inf]
+    contacts += [contact for contact in apart.contacts if contact.interval != gap]
+    return replace(
+        apart,
+        contacts=tuple(sorted(contacts, key=lambda contact: contact.time)),
+        hits=np.setdiff1d(apart.hits, [gap]),
+        restarts=np.setdiff1d(apart.restarts, [gap]),
+    )
+
+
+def _heights_below(surfaces: Surfaces, track: Track, gap: int, parts: Array) -> list[float]:
+    """m, heights of the surfaces below the line between the ends of a gap, at parts (k,) of its length."""
+    places = track.positions[gap] + parts[:, None] * (track.positions[gap + 1] - track.positions[gap])
+    places[:, Z] = track.positions[gap : gap + 2, Z].max()
+    heights: list[float] = surfaces.height_below(torch.from_numpy(places), 0.0).tolist()
+    return heights
+
+
+def _spliced(known: Segmentation, near: Segmentation, begin: int, gap: int) -> Segmentation:
+    """Events of a whole track, with others near a gap: between samples far from the events of both.
+
+    Args: near: of the samples from `begin` on, with their numbers in the track.
+    """
+    end = begin + len(near.quality) - 1
+    at = [one.interval for events in (known, near) for one in events.contacts]
+    at += np.concatenate(
+        (known.hits, near.hits, np.flatnonzero(known.quality), begin + np.flatnonzero(near.quality))
+    ).tolist()
+    first, last = _quiet(begin, gap, at), _quiet(gap + 1, end, at)
+    quality = known.quality.copy()
+    quality[first : last + 1] = near.quality[first - begin : last + 1 - begin]
+    contacts = [c for c in known.contacts if not first <= c.interval < last]
+    contacts += [c for c in near.contacts if first <= c.interval < last]
+    hits = known.hits[(known.hits < first) | (known.hits >= last)]
+    more = near.hits[(near.hits >= first) & (near.hits < last)]
+    return replace(
+        known, contacts=tuple(sorted(contacts, key=lambda c: c.time)), hits=np.union1d(hits, more), quality=quality
+    )
+
+
+def _quiet(first: int, last: int, at: Sequence[int]) -> int:
+    """The sample from `first` to `last` that is furthest from all intervals with events."""
+    samples = np.arange(first, last + 1)
+    away = np.abs(samples[:, None] - 0.5 - np.array(at)).min(axis=1, initial=np.inf)
+    return int(samples[away.argmax()])
+
+
+def _alike(one: Segmentation, other: Segmentation, gap: int) -> bool:
+    """True if two explanations differ in no number of contacts, no hit and no bad sample."""
+    return (
+        len(one.contacts) == len(other.contacts)
+        and _inside(one.contacts, gap) == _inside(other.contacts, gap)
+        and np.array_equal(one.hits, other.hits)
+        and np.array_equal(one.usable, other.usable)
+    )
+
+
+def _foretold(smoother: Smoother, problem: TrackProblem, solution: Solution, gap: int) -> int:
+    """Number of contacts in a gap of a ball that goes on as before."""
+    values, track = solution.minimum.values, problem.track
+    start = np.concatenate((values.states[gap], values.coefficients[: problem.width]))
+    heights = _heights_below(smoother.surfaces, track, gap, np.zeros(MOST))
+    dt = track.times[gap + 1] - track.times[gap]
+    with torch.no_grad():
+        _, times = fly_through(problem.ball, torch.from_numpy(start[None]), torch.tensor([dt]), tuple(heights))
+    return int((times < dt).sum())
+
+
+def _inside(contacts: Sequence[Contact], gap: int) -> int:
+    """Number of contacts in a gap."""
+    return sum(contact.interval == gap for contact in contacts)
+
+
+def _evidence(problem: TrackProblem, solution: Solution) -> float:
+    """nats, less the prices of contacts and hits; -inf without a minimum."""
+    if solution.minimum.step is None:
+        return -math.inf
+    events = solution.events
+    price = USUAL.contact_cost * len(events.contacts)
+    for step in np.diff(problem.track.times)[events.segmentation.hits].tolist():
+        price += rarity(USUAL.hit_rate, step) + USUAL.hit_cost * math.exp(-step / USUAL.short_gap)
+    return log_evidence(solution) - price
+
+
+def with_other_contacts(estimate: Estimate, other: Estimate, odds: float) -> Estimate:
+    """The estimate with covariances that hold another one's states too; odds: log, of its own."""
+    chance = 1.0 / (1.0 + math.exp(max(odds, 0.0)))
+    if not chance > CERTAIN:
+        return estimate
+    covariances = estimate.covariances.copy()
+    for k, near in enumerate(estimate.covariances):
+        far, jump = other.covariances[k], other.states[k] - estimate.states[k]
+        covariances[k] += widening(near, far, jump, chance)
+    return replace(estimate, covariances=covariances)

@@ -1,0 +1,116 @@
+"""Bounces in gaps between samples: their number, by closed form, and what stays in doubt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import EFFECTS, AnalyticModel
+from ballfg.estimation.flights.labels import label_samples
+from ballfg.estimation.result import Label
+from ballfg.estimation.segmentation.physics import physics_of
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.second_look.at_end import log_evidence
+from ballfg.estimation.smoother.second_look.gaps import with_other_contacts
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.factors.batch import COEFFICIENTS
+from ballfg.tracks import Track
+
+G, E, NOISE, RATE, GAP = 9.81, 0.9, 0.005, 60.0, 0.4
+MODEL = AnalyticModel([EFFECTS["gravity"](g=G), EFFECTS["restitution"](e=E), EFFECTS["table_height"](offset=0.0)])
+SMOOTHER = Smoother(MODEL, 0.0, Settings.for_measured(MODEL, position_noise=(NOISE,) * 3))
+ALONG = (4.0, 0.3)
+"""m/s, along the table."""
+
+
+def heights(times: np.ndarray, height: float, rise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Heights m, vertical velocities m/s, and times of the bounces s, of a ball without spin and drag."""
+    fall = (rise + np.sqrt(rise**2 + 2.0 * G * height)) / G
+    speed, since, bounces = np.sqrt(rise**2 + 2.0 * G * height), fall, list[float]()
+    z, v = height + rise * times - 0.5 * G * times**2, rise - G * times
+    while since < times[-1]:
+        bounces.append(since)
+        speed *= E
+        later = times >= since
+        z[later] = speed * (times[later] - since) - 0.5 * G * (times[later] - since) ** 2
+        v[later] = speed - G * (times[later] - since)
+        since += 2.0 * speed / G
+    return z, v, np.array(bounces)
+
+
+def with_a_gap(seed: int) -> tuple[Track, np.ndarray, np.ndarray]:
+    """A track without samples for a while, its true places and velocities (n, 6), and the times of all bounces."""
+    rng = np.random.default_rng(seed)
+    last = rng.uniform(0.8, 1.3)
+    begin = rng.uniform(0.06, last - GAP - 0.1)
+    times = np.arange(0.0, last, 1.0 / RATE)
+    times = times[(times < begin) | (times > begin + GAP)]
+    z, v, bounces = heights(times, rng.uniform(0.05, 0.4), rng.uniform(-1.0, 1.5))
+    across = [speed * times for speed in ALONG]
+    truth = np.column_stack((*across, z + MODEL.radius, np.tile(ALONG, (len(times), 1)), v))
+    return Track(times, truth[:, :3] + NOISE * rng.normal(size=(len(times), 3))), truth, bounces
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_bounces_in_a_gap_are_counted(seed: int) -> None:
+    """Several of these tracks had one too few or too many, and states dozens of standard deviations off."""
+    track, truth, bounces = with_a_gap(seed)
+    found = SMOOTHER.estimate(track)
+    assert [contact.time for contact in found.contacts] == pytest.approx(bounces, abs=0.06)
+    off = found.states[:, :6] - truth
+    assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[:, :6, :6]), off).max() < 40.0
+
+
+def test_a_gap_is_no_hand() -> None:
+    """Each side of a gap with two bounces in it is a flight."""
+    track, _, bounces = with_a_gap(22)
+    assert (np.diff(np.searchsorted(track.times, bounces)) == 0).any()
+    assert (label_samples(track, physics_of(MODEL), (MODEL.radius,)).values == Label.FLIGHT).all()
+
+
+def test_low_samples_on_both_sides_of_a_gap_are_no_low_hops() -> None:
+    """Two samples beside a bounce before the gap, two beside one after it, and half a metre between them unseen."""
+    fall = np.sqrt(2.0 * 0.3 / G)
+    times = fall + np.concatenate((np.arange(-12, 1), 45 + np.arange(12))) / 100.0
+    low, _, bounces = heights(times, 0.3, 0.0)
+    assert (np.abs(times - bounces[0]) < 0.011).sum() == 2
+    assert (low < 0.05).sum() >= 4
+    positions = np.column_stack((*(speed * times for speed in ALONG), low + MODEL.radius))
+    track = Track(times, positions + 0.003 * np.random.default_rng(3).normal(size=positions.shape))
+    assert SMOOTHER.low_hops(track, SMOOTHER.segment(track)) == ()
+
+
+def test_what_is_nearly_as_probable_is_in_the_covariance() -> None:
+    """The second moment of a mixture about its likelier part, or more."""
+    track, _, _ = with_a_gap(1)
+    problem, solution = SMOOTHER.solved(track)
+    one = SMOOTHER.result(problem, solution)
+    moved = replace(one, states=one.states + 0.3)
+    held = with_other_contacts(one, moved, np.log(0.8 / 0.2))
+    jump = (moved.states - one.states)[:, :, None]
+    mixture = one.covariances + 0.2 * jump * jump.swapaxes(1, 2)
+    assert np.linalg.eigvalsh(held.covariances - mixture).min() > -1e-9 * np.abs(mixture).max()
+    assert with_other_contacts(one, moved, 12.0) is one
+
+
+def test_the_evidence_is_that_of_a_dense_gaussian() -> None:
+    """Of the same factors, at the same point: minus half the log determinant of the whole information."""
+    track, _, _ = with_a_gap(2)
+    _, solution = SMOOTHER.solved(track)
+    values = solution.minimum.values
+    width = 9 * len(values.states)
+    information = np.zeros((width + len(values.coefficients),) * 2)
+    for batch in solution.graph.batches:
+        rows = batch.linearize(values)
+        weights = rows.loss.weight(np.linalg.norm(rows.residual, axis=1))
+        for number, weight in enumerate(weights):
+            own = np.zeros((rows.residual.shape[1], len(information)))
+            for variable, block in zip(rows.variables[number], rows.jacobians, strict=True):
+                first = width if variable == COEFFICIENTS else 9 * variable
+                own[:, first : first + block.shape[2]] += block[number]
+            information += weight * own.T @ own
+    spread = sum(batch.log_spread() for batch in solution.graph.batches if len(batch))
+    wanted = -solution.minimum.error - 0.5 * np.linalg.slogdet(information)[1] - spread
+    assert log_evidence(solution) == pytest.approx(wanted, abs=1e-6)
