@@ -35,6 +35,11 @@ YOUNG = 20
 """Number of samples after a contact in which the estimate may still move it to another interval."""
 
 
+LONGEST_UNSEEN = 0.3
+"""s. Longest gap over which the number of bounces is known at once: over a longer one the unknown acceleration alone
+moves the ball by the height of a hop. Gaps of 0.15 to 0.4 s (seeds 15, 16, 21 to 24) chose it."""
+
+
 class EventTracker:
     """Keeps a segmenter's final and pending events and turns them into a segmentation of the window.
 
@@ -44,7 +49,7 @@ class EventTracker:
     """
 
     def __init__(self, surfaces: Surfaces, physics: SegmentationPhysics, find_events: bool) -> None:
-        self.settings = SegmentationSettings()
+        self.settings = SegmentationSettings(longest_unseen=LONGEST_UNSEEN)
         self.physics = physics
         self.find_events = find_events
         self.segmenter = Segmenter(surfaces, physics, self.settings)

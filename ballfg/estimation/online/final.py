@@ -52,6 +52,8 @@ def final_estimate(
     part = track.between(float(track.times[first]), float(track.times[-1]))
     problem = smoother.problem(part, found)
     settled = smoother.settle(problem, Earlier(window.values, window.summaries()))
+    if not first:  # what has left the window is not known well enough
+        problem, settled = smoother.bridged(problem, settled)
     late = smoother.result(problem, settled, begins=not first)
     if not frozen:
         return late

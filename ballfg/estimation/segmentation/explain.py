@@ -12,7 +12,7 @@ from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL, TWO
 from ballfg.estimation.segmentation import bank
 from ballfg.estimation.segmentation.log import chain, compact, decide
 from ballfg.estimation.segmentation.result import HIT, LEAVE, OUTLIER, REST, RESTART, SHIFT
-from ballfg.estimation.segmentation.surface_contact import Step, advance, lift, put_down
+from ballfg.estimation.segmentation.surface_contact import Step, advance, lift, may_meet, put_down
 
 SHORTEST_STEP: Final = 1e-3
 """s. Least interval for the price of an event."""
@@ -158,7 +158,7 @@ def explain(
         time, position, sigma, index: of this one, as in `Sample`, with its number.
     """
     h, dt, now, old = len(held), time - before, held.copy(), len(log)
-    gap = h > 0 and dt > scene.longest_gap
+    gap = h > 0 and (dt > scene.longest_gap or (dt > scene.longest_unseen and may_meet(now, dt, scene, surfaces)))
     steps = 1 if h == 0 or gap else max(1, math.ceil(dt / scene.longest_step))
     branched = max(h, int(scene.most)) * (1 + 2 * len(surfaces))
     room, fill = 2 * (branched + MOST_ADDED + len(surfaces)), np.zeros(2, np.int64)

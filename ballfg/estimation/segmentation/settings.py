@@ -1,5 +1,6 @@
 """Defines the segmentation's parameters: noise, prior spreads, prices of events, bounds of the search."""
 
+import math
 from dataclasses import dataclass
 
 
@@ -89,6 +90,9 @@ class SegmentationSettings:
     """s. Over longer gaps no shift is tried, and a hit does not use the prediction."""
     longest_gap: float = 0.5
     """s. Nothing links the two sides of a longer gap: the slack alone moves the ball by half a metre."""
+    longest_unseen: float = math.inf
+    """s. Nothing links the two sides of a longer gap in which the ball may meet a surface; the smoother compares
+    numbers of bounces instead."""
     friction_excess: float = 1.4
     """Tangential jump of a contact, in units of the largest by friction, beyond which a hit is added."""
 

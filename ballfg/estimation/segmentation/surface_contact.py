@@ -93,6 +93,8 @@ BOUNCE_JITTER: Final = 0.03
 """m/s, of the normal velocity after a bounce, whatever its speed."""
 SLIDE_JITTER: Final = 0.05
 """m/s, of the tangential velocity, likewise."""
+SURELY: Final = 3.0
+"""Standard deviations of a foretold height."""
 WEAKEST_FALL: Final = 0.2
 """Share of gravity below which the slack cannot hold the ball up."""
 
@@ -126,6 +128,17 @@ def advance(work: bank.Work, step: Step, scene: bank.Record, surfaces: bank.Reco
     for surface in range(len(surfaces)):
         if lowest < surfaces[surface].centre:
             _branch(before, work, surface, step, scene, surfaces)
+
+
+@machine_code(FLAG(bank.BANK, REAL, bank.SCENE, bank.SURFACES))
+def may_meet(held: bank.Records, dt: float, scene: bank.Record, surfaces: bank.Records) -> bool:
+    """Whether the best hypothesis may come down to the highest surface within dt s."""
+    if len(surfaces) == 0 or held[0].surface != bank.FLYING:
+        return False
+    later = held[:1].copy()
+    carry(later[0], dt, scene)
+    low = later[0].mean[2, 0] - later[0].shift[2] - SURELY * math.sqrt(later[0].cov[2, 0, 0])
+    return low < surfaces[0].centre
 
 
 @machine_code(NOTHING(bank.BANK, bank.WORK, COUNT, STEP, bank.SCENE, bank.SURFACES))

@@ -9,6 +9,7 @@ import pytest
 
 from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.estimation.flights.labels import label_samples
+from ballfg.estimation.online.online import Online
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
@@ -61,6 +62,20 @@ def test_bounces_in_a_gap_are_counted(seed: int) -> None:
     assert [contact.time for contact in found.contacts] == pytest.approx(bounces, abs=0.06)
     off = found.states[:, :6] - truth
     assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[:, :6, :6]), off).max() < 40.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_stream_does_not_guess_the_bounces_in_a_gap(seed: int) -> None:
+    """States after a long gap are those of the samples after it, until these are enough; the whole track links them."""
+    track, truth, bounces = with_a_gap(seed)
+    gap, stream = int(np.diff(track.times).argmax()), Online(MODEL, 0.0, SMOOTHER.settings)
+    for k, (time, position) in enumerate(zip(track.times, track.positions, strict=True)):
+        told = stream.push(time, position)
+        if k > gap and told is not None:
+            off = told.mean[:6] - truth[k]
+            assert off @ np.linalg.solve(told.joint[:6, :6], off) < 40.0
+    found = Online(MODEL, 0.0, SMOOTHER.settings).estimate(track)
+    assert [contact.time for contact in found.contacts] == pytest.approx(bounces, abs=0.06)
 
 
 def test_a_gap_is_no_hand() -> None:

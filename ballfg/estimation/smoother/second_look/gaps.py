@@ -75,7 +75,7 @@ def _gaps(track: Track, events: Segmentation) -> list[int]:
         return []
     steps = np.diff(track.times)
     long = steps > max(USUAL.short_gap, MANY_STEPS * float(np.median(steps)))
-    long[events.restarts] = False
+    long &= steps <= USUAL.longest_gap
     for rest in events.rests:
         long[rest.first : rest.last + 1] = False
     return [int(interval) for interval in np.flatnonzero(long)]
@@ -163,11 +163,12 @@ def _spliced(known: Segmentation, near: Segmentation, begin: int, gap: int) -> S
     quality[first : last + 1] = near.quality[first - begin : last + 1 - begin]
     contacts = [c for c in known.contacts if not first <= c.interval < last]
     contacts += [c for c in near.contacts if first <= c.interval < last]
-    hits = known.hits[(known.hits < first) | (known.hits >= last)]
-    more = near.hits[(near.hits >= first) & (near.hits < last)]
-    return replace(
-        known, contacts=tuple(sorted(contacts, key=lambda c: c.time)), hits=np.union1d(hits, more), quality=quality
+    hits, restarts = (
+        np.union1d(old[(old < first) | (old >= last)], new[(new >= first) & (new < last)])
+        for old, new in ((known.hits, near.hits), (known.restarts, near.restarts))
     )
+    ordered = tuple(sorted(contacts, key=lambda c: c.time))
+    return replace(known, contacts=ordered, hits=hits, restarts=restarts, quality=quality)
 
 
 def _quiet(first: int, last: int, at: Sequence[int]) -> int:
