@@ -91,6 +91,12 @@ class Choice(Plain):
         return f"Chosen: {self.chosen}, the simplest model that none surely beats."
 
 
+def check_enough(fitted: Sequence[str]) -> None:
+    """Refuses fewer fitted tracks than a choice needs. Raises: ValueError."""
+    if len(fitted) < LEAST:
+        raise ValueError(f"kind: auto needs {LEAST} tracks to fit; got {len(fitted)}. Add some, or write calibrate.")
+
+
 def choose_candidate(problem: calibrate.Problem, watch: Watch = unwatched) -> tuple[Choice, dict[str, Fitted]]:
     """Compare the candidates within the fitted tracks of a problem.
 
@@ -98,8 +104,7 @@ def choose_candidate(problem: calibrate.Problem, watch: Watch = unwatched) -> tu
     Raises: ValueError: too few tracks.
     """
     fitted = problem.split.fit
-    if len(fitted) < LEAST:
-        raise ValueError(f"kind: auto needs {LEAST} tracks to fit; got {len(fitted)}. Add some, or write calibrate.")
+    check_enough(fitted)
     problem = replace(problem, split=replace(problem.split, judge=()))
     plain = replace(problem, config=config_of(problem.config, CALIBRATED), groups=None)
     config = config_of(problem.config, GROUPED)

@@ -22,6 +22,7 @@ from ballfg.learning.calibration.auto import (
     UNLEARNED,
     Choice,
     Fitted,
+    check_enough,
     choose_candidate,
     config_of,
 )
@@ -78,6 +79,8 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         dataset = open_source(config.data, config.source, config.anyway)
         model = analytic_model(config.model, dataset.info.ball)
         problem = pose(dataset, model, config, config.jobs or jobs)
+        if config.kind == AUTO:
+            check_enough(problem.split.fit)
         if not resume:
             files.start(folder, config)
         fit, judge = len(problem.split.fit), len(problem.split.judge)

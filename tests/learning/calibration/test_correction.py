@@ -309,12 +309,20 @@ def test_a_run_that_keeps_the_nominal_model_says_so_by_its_status(
 ) -> None:
     rows = {name: scored(np.array([1.0, 2.0, 3.0])) for name in CANDIDATES}
     monkeypatch.setattr(run, "choose_candidate", lambda *_: (compared(rows), {}))
-    problem = posed(tmp_path, 0.0, 4)
+    problem = posed(tmp_path, 0.0, 8)
     config = problem.config.model_copy(update={"kind": "auto"})
     assert run_calibration(config, tmp_path / "out", resume=False, jobs=1, watch=unwatched) == 1
     assert model_to_dict(load_model(tmp_path / "out" / "model.yaml")) == model_to_dict(nominal_model())  # type: ignore[arg-type]
     assert "No model surely beats the nominal one" in capsys.readouterr().out
     assert (tmp_path / "out" / "choice.json").is_file()
+
+
+def test_too_few_tracks_leave_no_folder_behind(tmp_path: Path) -> None:
+    """Else the same command is refused with more tracks: the folder would hold an earlier run."""
+    config = posed(tmp_path, 0.0, 6).config.model_copy(update={"kind": "auto"})
+    with pytest.raises(ValueError, match="auto needs 4 tracks to fit; got 3"):
+        run_calibration(config, tmp_path / "out", resume=False, jobs=1, watch=unwatched)
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_config_of_a_candidate() -> None:
