@@ -66,7 +66,12 @@ class Candidate(Plain):
     coverage_90: float  # Share of measured coordinates inside their 90 % intervals
     log_score: float  # Mean over tracks, per coordinate and metre
     gain: float  # Mean difference from the best simpler candidate; 0 for the first
-    gain_error: float  # Standard error of the gain over tracks
+    gain_error: float | None  # Standard error of the gain over tracks; None: unknown, of one track
+
+    @property
+    def gained(self) -> str:
+        """The gain with its standard error."""
+        return f"{self.gain:+z.3f} ± {'unknown' if self.gain_error is None else f'{self.gain_error:.3f}'}"
 
 
 class Choice(Plain):
@@ -79,7 +84,7 @@ class Choice(Plain):
         """The candidates as plain text."""
         rows = [("model", "tracks", "median RMSE, mm", "90 % hold, %", "log score", "gain over the best simpler")]
         for one in self.candidates:
-            gain = "" if one is self.candidates[0] else f"{one.gain:+.3f} ± {one.gain_error:.3f}"
+            gain = "" if one is self.candidates[0] else one.gained
             numbers = (f"{1e3 * one.rmse_median:.1f}", f"{100 * one.coverage_90:.0f}", f"{one.log_score:.3f}")
             rows.append((one.name, str(one.tracks), *numbers, gain))
         return "\n".join(aligned(rows))
@@ -207,10 +212,12 @@ def compared(scores: dict[str, Sequence[TrackScore | None]]) -> Choice:
         if found is None:
             raise ValueError("tracks must be judged by every candidate; none was. Look at them with ballfg show.")
         own, gains, count = logs[name], logs[name] - logs[chosen], len(logs[name])
-        gain, error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(count)) if count > 1 else 0.0
+        gain, error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(count)) if count > 1 else None
         numbers = {"rmse_median": found.rmse_median, "coverage_90": found.coverage_90, "log_score": float(own.mean())}
         candidates.append(Candidate(name=name, tracks=count, gain=gain, gain_error=error, **numbers))
-        if gain > max(0.0 if name == CALIBRATED else SURELY * error, NOTICED):
+        # one track alone tells nothing about others: no richer model surely gains on it
+        needed = 0.0 if name == CALIBRATED else np.inf if error is None else SURELY * error
+        if gain > max(needed, NOTICED):
             chosen = name
     return Choice(chosen=chosen, candidates=tuple(candidates))
 

@@ -152,8 +152,7 @@ class Record:
         left = "" if gains else ", which the model file holds"
         sentence = (
             f"The network {said} the calibrated model{left}: median errors are {1e3 * after.rmse_median:.1f} and "
-            f"{1e3 * before.rmse_median:.1f} mm, the log score changes by {after.gain:+z.3f} ± "
-            f"{after.gain_error:.3f}."
+            f"{1e3 * before.rmse_median:.1f} mm, the log score changes by {after.gained}."
         )
         return path, sentence, gains
 

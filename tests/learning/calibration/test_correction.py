@@ -325,6 +325,18 @@ def test_too_few_tracks_leave_no_folder_behind(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_on_one_track_no_richer_model_surely_gains() -> None:
+    """The spread between tracks is unknown there; calibration alone needs no sureness."""
+    one, more = scored(np.array([3.0])), scored(np.array([4.0]))
+    choice = compared({"calibrated, without network": one, "with network": more})
+    assert choice.chosen == "calibrated, without network"
+    assert choice.candidates[1].gain_error is None
+    assert "+1.000 ± unknown" in choice.table()
+    assert compared({NOMINAL: one, "calibrated": more}).chosen == "calibrated"
+    two = compared({"without": scored(np.array([3.0, 3.0])), "with": scored(np.array([4.0, 3.9]))})
+    assert two.chosen == "with"
+
+
 def test_the_config_of_a_candidate() -> None:
     auto = CalibrationConfig(kind="auto", data="shots")
     assert config_of(auto, CORRECTED) == CalibrationConfig(groups="group", correction=True, data="shots")
