@@ -89,6 +89,17 @@ class BallModel(nn.Module, ABC):
                 model = _with_value(model, name, value)
         return model
 
+    def for_group(self, by: str, group: str) -> Self:
+        """The model with the coefficients of a group of tracks, such as a stream of one launcher's shots.
+
+        Args: by: the label that names groups.  group: its value.
+        """
+        model = self
+        for name, variation in self.variations.items():
+            if variation.by == by and (value := variation.of_label(group)) is not None:
+                model = _with_value(model, name, value)
+        return model
+
     @property
     def in_flight(self) -> "BallModel":
         """The same motion without randomness; the model itself if it is not random."""

@@ -66,14 +66,18 @@ class Variation:
         """The coefficient of a track; None for the model's own value."""
         if self.by != TRACK:
             label = track.labels.get(self.by)
-            level = None if label is None else level_of(label, self.values)
-            return None if level is None else self.values[level]
+            return None if label is None else self.of_label(label)
         if self.line:
             place = number_of(track.name)
             known = np.array(sorted((float(number_of(name) or 0), value) for name, value in self.values.items()))
             return None if place is None else float(np.interp(place, known[:, 0], known[:, 1]))
         begun = [name for name in self.values if place_of(name) <= place_of(track.name)]
         return self.values[max(begun, key=place_of)] if begun else None
+
+    def of_label(self, label: float | str) -> float | None:
+        """The coefficient by a label's value; None for the model's own value."""
+        level = level_of(label, self.values)
+        return None if level is None else self.values[level]
 
     @classmethod
     def from_mapping(cls, content: Any) -> "Variation":

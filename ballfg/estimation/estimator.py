@@ -60,6 +60,8 @@ class Estimator(ABC):
                 f"settings.solver must be 'ballfg' or None for the estimator '{self.name}', which has no factor graph; "
                 "got 'gtsam'. Use the smoother or the online estimator."
             )
+        if settings.group is not None and settings.spins is not None:
+            model = model.for_group(settings.spins.by, settings.group)
         self.model = model
         self.surfaces = known
         self.settings = settings

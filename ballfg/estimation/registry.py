@@ -1,6 +1,8 @@
 """Registers the estimators by name: those of the package, of the user, and of other installed packages."""
 
+import copy
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -25,7 +27,8 @@ class EachItsModel(Estimator):
     def __init__(
         self, make: Callable[[BallModel], Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings
     ) -> None:
-        super().__init__(model, surfaces, settings)
+        super().__init__(model, surfaces, replace(settings, group=None))  # a track's own label comes first
+        self.settings = replace(self.settings, group=settings.group)
         self._make = make
         self._made: dict[tuple[float | None, ...], Estimator] = {}
 
@@ -34,7 +37,9 @@ class EachItsModel(Estimator):
         track = self.settings.grouped(track)
         values = tuple(variation.value(track) for variation in self.model.variations.values())
         if values not in self._made:
-            self._made[values] = self._make(self.model.for_track(track))
+            own = copy.copy(self.model.for_track(track))
+            own.variations = {}  # one ball, whatever the settings' group
+            self._made[values] = self._make(own)
         return self._made[values]
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:

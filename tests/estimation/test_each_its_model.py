@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.dynamics.variation import Variation
-from ballfg.estimation import Settings, predict_tracks
+from ballfg.estimation import Online, Settings, predict_tracks
 from ballfg.estimation.batch import estimate_tracks
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.registry import make_estimator
@@ -18,7 +19,7 @@ from ballfg.simulation import SimulationConfig, parse_effects, simulate
 
 SETTINGS = Settings(position_noise=(0.002, 0.002, 0.002))
 UNSURE = replace(SETTINGS, coefficients={"bounce.restitution.e": 0.01, "flight.drag.k": 0.01})
-TABLE = Surfaces.table_tennis(0.0)
+TABLE = Surfaces.table_tennis(0.76)  # that of the simulation
 METHODS = ("smoother", "online", "ekf", "sliding-window")
 
 
@@ -84,3 +85,28 @@ def test_noise_is_looked_for_about_each_tracks_own_motion(tracks):
         alone = linearise(Smoother(with_restitution(e), TABLE, SETTINGS), tracks[row : row + 1])
         count = alone.errors.shape[1]
         np.testing.assert_allclose(together.errors[row, :count], alone.errors[0], atol=1e-12)
+
+
+def test_a_stream_of_a_group_has_the_coefficients_of_the_group(tracks):
+    """A stream has no labels: its settings name the group, whose coefficients count beside its spins."""
+    groups = SpinPopulation("group", {name: SpinGroup((0.0,) * 3, (60.0,) * 3, 10) for name in ("old", "new")})
+    track = tracks[0]
+    for group, e in (("old", 0.8), ("new", 0.95)):
+        settings = replace(SETTINGS, spins=groups, group=group)
+        streams = [Online(model, TABLE, settings) for model in (varied(old=0.8, new=0.95), with_restitution(e))]
+        for time, position in zip(track.times, track.positions, strict=True):
+            found, expected = (stream.push(time, position) for stream in streams)
+        assert found is not None
+        np.testing.assert_array_equal(found.mean, expected.mean)
+
+
+@pytest.mark.parametrize("label", ["old", "other", None])
+def test_the_group_of_the_settings_is_that_of_tracks_without_a_label(tracks, label):
+    """A label that the model does not know is none of its groups: the model's own value holds."""
+    groups = SpinPopulation("group", {name: SpinGroup((0.0,) * 3, (60.0,) * 3, 10) for name in ("old", "new")})
+    settings = replace(SETTINGS, spins=groups, group="new")
+    track = replace(tracks[0], labels={} if label is None else {"group": label})
+    found = make_estimator("smoother", varied(old=0.8, new=0.95), TABLE, settings).estimate(track)
+    model = {"old": with_restitution(0.8), "other": nominal_model(), None: with_restitution(0.95)}[label]
+    alone = make_estimator("smoother", model, TABLE, settings).estimate(track)
+    np.testing.assert_array_equal(found.states, alone.states)

@@ -254,6 +254,32 @@ def test_the_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.fullmatch(r"in 0\.7\d\d s, at y = 0\.2\d\d m, z = 0\.\d+ m \+- \d+ mm\n30 of 30 states\n", said)
 
 
+VARIED = """\
+flight: {gravity: {}, drag: {k: 0.125}}
+bounce: {restitution: {e: 0.92}}
+variations:
+  flight.drag.k: {by: player, values: {ann: 0.25, bob: 0.0625}}
+populations:
+  spin: {by: player, groups: {ann: {mean: [0, 9, 0], sigma: [9, 9, 9], tracks: 4},
+    bob: {mean: [0, 9, 0], sigma: [9, 9, 9], tracks: 4}}}
+"""
+
+
+def test_a_group_has_its_coefficients_and_without_one_the_header_says_what_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("model.yaml").write_text(VARIED)
+    for group, drag in (("ann", ".25"), ("bob", ".0625"), (None, ".125")):
+        assert status("export", "model.yaml", "--out", "ball.h", *(("--group", group) if group else ())) == 0
+        assert f"ball_rates_coefficients[2] = {{9.81,{drag}}};" in Path("ball.h").read_text()
+        note = "flight.drag.k differs by player; the header has 0.125, that of other tracks. Give --group NAME"
+        assert (note in capsys.readouterr().err) == (group is None)
+    assert status("export", "model.yaml", "--out", "other.h", "--group", "eve") == 2
+    assert "group must be one of the model's, ann, bob; got 'eve'" in capsys.readouterr().err
+    assert not Path("other.h").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -1,7 +1,7 @@
 """Implements `ballfg compile`, which makes machine code ahead of its first use, and `export`, which makes C of it."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from ballfg.cli import inputs
-from ballfg.progress import progress
+from ballfg.progress import print_notes, progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
@@ -92,6 +92,10 @@ def export(
         str | None,
         typer.Option(help="Known ball that gives a model file radius and inertia.", show_default="table_tennis"),
     ] = None,
+    group: Annotated[
+        str | None,
+        typer.Option(help="Group of the model whose coefficients the header has.", show_default="what all share"),
+    ] = None,
     effects_file: inputs.EffectsFiles = None,
 ) -> None:
     """A model as one C header: flight, contacts, Jacobians, predictions with covariance. It needs no library.
@@ -100,6 +104,7 @@ def export(
 
     Example: ballfg export model.yaml --language c --out ball.h
     """
+    from ballfg.estimation import Settings
     from ballfg.files.whole_file import check_file, write_text
     from ballfg.prediction.c_header import c_header
 
@@ -111,5 +116,23 @@ def export(
     if path is None and ball is not None:
         raise ValueError(f"ball must come with a model file; got {ball!r} with '{model}'. Leave one of them out.")
     known, settings = inputs.model_alone(path, model if path is None else ball)
+    Settings(spins=known.spins, group=group)  # refuses what is no group of the model
+    if group is not None and known.spins is not None:
+        known = known.for_group(known.spins.by, group)
+    print_notes(_shared(known, group))
     write_text(out, c_header(known, out.stem, settings.process))
     print(f"{out}: {out.stem}_fly, {out.stem}_contact, {out.stem}_predict, {out.stem}_cross_plane")
+
+
+def _shared(model: "BallModel", group: str | None) -> Iterator[str]:
+    """A note on each coefficient that differs between tracks, of which the header has one value.
+
+    Args: group: whose coefficients the model has already; None: none.
+    """
+    values = dict(model.named_parameters())
+    for name, variation in model.variations.items():
+        known = model.spins is not None and variation.by == model.spins.by
+        if not known or group is None or variation.of_label(group) is None:
+            remedy = " Give --group NAME for a group's." if known and group is None else ""
+            own = float(values[name].detach())
+            yield f"{name} differs by {variation.by}; the header has {own:g}, that of other tracks.{remedy}"
