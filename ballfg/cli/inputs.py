@@ -157,7 +157,12 @@ class Inputs(Generic[D]):
         Settings(spins=self.model.spins, group=group)
         print_doubts(usual_noise(self.dataset, self.model))
         settings = fitted_settings(self.dataset, self.model, self.observed, progress)
-        return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver, group=group))
+        spins = self.model.spins
+        if group is not None:
+            settings = replace(settings, spins=spins, group=group)
+        elif spins is not None and settings.group is None and spins.by not in self.dataset.label_names:
+            print_notes([f"no track names its group ({spins.by}): all get {spins.of_others}. --group NAME gives one"])
+        return make_estimator(method, self.model, self.surfaces, replace(settings, solver=solver))
 
 
 def flights_only(data: "Dataset", anyway: bool) -> Any:

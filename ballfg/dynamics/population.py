@@ -78,6 +78,13 @@ class SpinPopulation:
         away = means - mean
         return mean, np.diag(share @ sigmas**2) + (share * away.T) @ away
 
+    def tells_of(self, group: str | None) -> bool:
+        """Whether it tells the spins of a group's shots. One group alone does not show how others differ from it.
+
+        Args: group: its name; None: a track that names none, which may be of any group.
+        """
+        return group is None or len(self.groups) > 1 or level_of(group, self.groups) is not None
+
     def check(self, group: str) -> None:
         """Refuses an unknown group. Raises: ValueError: if there is no such group."""
         if level_of(group, self.groups) is None:
@@ -94,8 +101,14 @@ class SpinPopulation:
             return ()
         return (
             f"{len(others)} of {len(named)} tracks are of groups ({self.by}) that the model does not know, such as "
-            f"{shown(label_text(others[0]))}: they get the mixture of all its groups, {listed(self.groups)}",
+            f"{shown(label_text(others[0]))}: they get {self.of_others}",
         )
+
+    @property
+    def of_others(self) -> str:
+        """The prior of tracks of no known group, in words."""
+        prior = "mixture of all its groups" if len(self.groups) > 1 else "usual prior of spins, not its only group's"
+        return f"the {prior}, {listed(self.groups)}"
 
     @classmethod
     def from_mapping(cls, content: Any) -> Self:

@@ -13,6 +13,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.model_file import check_spreads, model_to_dict
 from ballfg.dynamics.networks.fading import DOUBT
 from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation.flights.dataset import in_flight
@@ -30,6 +31,7 @@ from ballfg.progress import Watch, doing, unwatched
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.info import DatasetInfo
 from ballfg.tracks.noise import TrackNoise
+from ballfg.tracks.track import level_of
 
 TRACKS_FOR_NOISE = 50  # Number of tracks for the estimate of the measurement noise when a dataset does not state it
 QUICK_TRACKS = 20
@@ -93,7 +95,18 @@ def _settings(dataset: Dataset | SightedDataset, model: BallModel, noises: Seque
         settings = settings if stated is None else with_noise(settings, stated)
     if dataset.one_view:  # predictions have one process noise for all tracks
         settings = replace(settings, process=settings.for_track(next(iter(dataset))).process)
-    return settings if model.spins is None else replace(settings, spins=model.spins)
+    return settings if model.spins is None else _grouped(settings, dataset, model.spins)
+
+
+def _grouped(settings: Settings, dataset: Dataset | SightedDataset, spins: SpinPopulation) -> Settings:
+    """The settings with a model's groups; tracks without the label are the dataset's own group, as in training.
+
+    Where none has it, and that group is not the model's only one, they keep the usual prior.
+    """
+    own = level_of(dataset.info.name, spins.groups)
+    if spins.by not in dataset.label_names and not spins.tells_of(dataset.info.name):
+        return settings
+    return replace(settings, spins=spins, group=own)
 
 
 def _own_noise(dataset: Dataset | SightedDataset, model: BallModel) -> TrackNoise | None:

@@ -25,6 +25,7 @@ from ballfg.estimation.launcher import Launcher, SpinLabel, group_spin
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
+from ballfg.tracks.track import label_text
 
 Solver = Literal["ballfg", "gtsam"]
 SOLVERS: Final[tuple[Solver, ...]] = get_args(Solver)
@@ -218,9 +219,11 @@ class Settings:
         if track.spin_label is not None:
             return SpinLabel(track.spin_label, self.spin_label_noise)
         label = None if self.launcher is None else self.launcher.label(track)
-        if label is None and self.spins is not None:
-            return group_spin(self.spins, track, self.group)
-        return label
+        if label is not None or self.spins is None:
+            return label
+        own = track.labels.get(self.spins.by)
+        known = self.spins.tells_of(None if own is None else label_text(own))
+        return group_spin(self.spins, track, self.group) if known else None
 
 
 _TYPES: dict[str, type] = {

@@ -33,6 +33,14 @@ def test_a_number_names_the_group_of_earlier_files_and_unknown_ones_are_counted(
     assert note.startswith("2 of 3 tracks are of groups (session) that the model does not know, such as '3': ")
 
 
+def test_one_group_alone_does_not_show_how_others_differ_from_it() -> None:
+    alone = SpinPopulation("group", {"top": TOP})
+    assert [alone.tells_of(group) for group in ("top", None, "side")] == [True, True, False]
+    assert SPINS.tells_of("side")
+    (note,) = alone.unknown([{"group": "side"}])
+    assert note.endswith("they get the usual prior of spins, not its only group's, top")
+
+
 @pytest.mark.parametrize("unknown", [None, "side"])
 def test_an_unknown_group_has_the_moments_of_the_mixture(unknown: str | None) -> None:
     generator, count = np.random.default_rng(4), 400_000

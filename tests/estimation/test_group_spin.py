@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +13,13 @@ import ballfg as bf
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.paths import paths
 from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
-from ballfg.estimation import Online, Settings, Smoother, predict_tracks
+from ballfg.estimation import Online, Settings, Smoother, dataset_settings, predict_tracks
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.registry import make_estimator
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY
-from ballfg.tracks import Track
+from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
+from ballfg.tracks.info import DatasetInfo
 from ballfg.tracks.noise import TrackNoise
 from ballfg.tracks.track import SPIN_LABELS
 
@@ -77,6 +79,38 @@ def test_an_unknown_group_has_the_mixture_as_prior() -> None:
     axes = launch_axes(START[3:])
     np.testing.assert_allclose(axes @ estimate.states[0, SPIN], mean, atol=5.0)
     np.testing.assert_allclose(axes @ estimate.covariances[0][SPIN, SPIN] @ axes.T, covariance, rtol=0.05, atol=150.0)
+
+
+@pytest.mark.parametrize("method", ["smoother", "online", "ekf", "sliding-window"])
+def test_another_group_than_the_only_known_one_has_the_usual_prior(method: str) -> None:
+    """Else its spins are sought beside those of shots that are not its own, however few samples show them."""
+    alone, track = SpinPopulation("player", {"ann": SPINS.groups["ann"]}), shot("bob", 12, player="bob")
+    found, usual = (
+        make_estimator(method, MODEL, TABLE, settings(spins=spins)).estimate(track) for spins in (alone, None)
+    )
+    np.testing.assert_array_equal(found.states, usual.states)
+    np.testing.assert_array_equal(found.covariances, usual.covariances)
+
+
+@pytest.mark.parametrize(
+    ("name", "labels", "groups", "known", "group"),
+    [
+        ("ann", {}, "ann", True, "ann"),  # the dataset that trained: its tracks without a label are its own group
+        ("ann", {"player": "bob"}, "ann bob", True, "ann"),
+        ("room", {}, "ann bob", True, None),
+        ("room", {}, "ann", False, None),  # another room, about which its only group says nothing
+        ("room", {"player": "ann"}, "ann", True, None),
+    ],
+)
+def test_tracks_without_a_label_are_of_their_datasets_own_group(
+    name: str, labels: dict[str, str], groups: str, known: bool, group: str | None, tmp_path: Path
+) -> None:
+    model = nominal_model()
+    model.spins = SpinPopulation("player", {one: SPINS.groups[one] for one in groups.split()})
+    info = DatasetInfo(name=name, table_height=0.0, ball=TABLE_TENNIS, position_noise=0.001)
+    write_dataset(tmp_path / "shots", info, [replace(shot("ann", **labels), name="a")])
+    found = dataset_settings(read_dataset(tmp_path / "shots"), model)
+    assert (found.spins, found.group) == (model.spins if known else None, group)
 
 
 def test_a_spin_label_takes_precedence() -> None:

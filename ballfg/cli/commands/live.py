@@ -167,7 +167,9 @@ def _scene(
     if noise is not None:
         sigma = check_number("noise", noise, "m", above=0.0, limit=1.0, instead="mm")
         settings = replace(settings, position_noise=(sigma,) * 3)
-    return ball, surfaces, replace(settings, spins=ball.spins, group=group)
+    if data is None or group is not None:
+        settings = replace(settings, spins=ball.spins, group=group)
+    return ball, surfaces, settings
 
 
 def _source(

@@ -29,7 +29,7 @@ from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
-from ballfg.estimation.settings import Settings, Solver, sample_sigmas, total_sigmas
+from ballfg.estimation.settings import Settings, Solver, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
 from ballfg.estimation.smoother.motion import FLIGHT
@@ -381,6 +381,8 @@ class Online(Estimator):
         self.reset()
         self._frozen = []
         label = self.settings.spin_label(track)
+        if label is None and self.settings.spins is not None:
+            label = spin_start(None, self.settings)  # else the first sample has the spins of a stream of any group
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
         samples = [
             Sample(float(t), position, spread, label=label if k == 0 else None, measured=not track.rough)
