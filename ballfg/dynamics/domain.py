@@ -55,9 +55,8 @@ class Domain:
         outside = np.concatenate([np.any(list(own.values()), axis=0) for own in beyond]).mean() if beyond else 0.0
         if not outside > FEW:
             return []
-        far = [
-            name for name in self.ranges if np.mean([own[name].mean() for own in beyond if name in own] or [0]) > FEW
-        ]
+        shares = {n: np.mean([own[n].mean() for own in beyond if n in own] or [0]) for n in self.ranges}
+        far = [n for n in shares if shares[n] > FEW] or [n for n in shares if shares[n] > 0.0]  # few each, many in all
         words = (f"{n} {self.ranges[n][0]:.3g} to {self.ranges[n][1]:.3g} {UNITS[n]}" for n in far)
         return [f"{100 * outside:.0f} % of the samples lie outside of what {model} was fitted on ({', '.join(words)})"]
 

@@ -52,3 +52,12 @@ def test_a_model_file_keeps_it(tmp_path: Path) -> None:
 def test_damaged_sections_are_refused(ranges: dict[str, tuple[float, float]]) -> None:
     with pytest.raises(ValueError, match=r"domain: \{speed"):
         Domain(ranges)
+
+
+def test_a_doubt_names_quantities_that_few_samples_each_are_beyond() -> None:
+    """4 % of the samples are too far along x, other 4 % along z: 8 % lie outside."""
+    positions = np.full((50, 3), 0.5)
+    positions[:2, 0] = positions[2:4, 2] = 3.0
+    fitted = Domain({axis: (0.0, 1.0) for axis in "xyz"})
+    (doubt,) = fitted.doubts([Track(0.01 * np.arange(50), positions)], "m.yaml")
+    assert doubt == "8 % of the samples lie outside of what m.yaml was fitted on (x 0 to 1 m, z 0 to 1 m)"
