@@ -114,4 +114,5 @@ def describe(model: AnalyticModel, problem: Problem, settings: Settings, noise: 
     """Give a calibrated model its population's spins, the noise, and the extent of the fitted tracks, for a file."""
     model.noise, model.spins = None if noise is None else noise.noise, settings.spins
     if isinstance(problem.dataset, Dataset):
-        model.domain = Domain.of(track for track in problem.dataset if track.name in problem.split.fit)
+        fitted = (track for track in problem.dataset if track.name in problem.split.fit)
+        model.domain = Domain.of(fitted, [problem.dataset.info.ball.radius])

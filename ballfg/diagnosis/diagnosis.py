@@ -93,7 +93,7 @@ def diagnose(
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
     whole = next_shot_model(search.whole, holdout.launcher.embedding, corrected)
     whole.noise = corrected.noise
-    whole.domain = Domain.of(dataset) if search.findings else model.domain
+    whole.domain = Domain.of(dataset, [dataset.info.ball.radius]) if search.findings else model.domain
     after = search.judged if helped is None else helped.after
     budget = budget_of(corrected, holdout, search.before.prediction_rmse_mm, after.prediction_rmse_mm, jobs)
     return Diagnosis(

@@ -1,6 +1,6 @@
 """The range of speeds, spins and places that a model was fitted on, and what lies outside of it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -10,7 +10,8 @@ from ballfg.arrays import Array
 from ballfg.checks import check_instance, check_number, shown
 from ballfg.tracks import Track
 
-UNITS: Final = {"x": "m", "y": "m", "z": "m", "speed": "m/s", "spin": "rad/s"}
+RADIUS: Final = "radius"
+UNITS: Final = {RADIUS: "m", "x": "m", "y": "m", "z": "m", "speed": "m/s", "spin": "rad/s"}
 """Quantities with their units; a spin is known of labelled tracks alone."""
 SPAN: Final = 0.1  # s, over which a speed is measured: 5 mm of noise are 0.07 m/s
 RARE: Final = 0.002  # share of the samples at either end that are no part of the range: outliers of trackers
@@ -37,12 +38,19 @@ class Domain:
         object.__setattr__(self, "ranges", {name: (float(a), float(b)) for name, (a, b) in self.ranges.items()})
 
     @classmethod
-    def of(cls, tracks: Iterable[Track]) -> Self | None:
-        """The ranges of tracks; None without samples."""
+    def of(cls, tracks: Iterable[Track], radii: Sequence[float] = ()) -> Self | None:
+        """The ranges of tracks; None without samples. Args: radii: m, of their balls."""
         found = [quantities(track) for track in tracks]
         held = {name: [own[name] for own in found if name in own] for name in UNITS}
         ends = {n: np.quantile(np.concatenate(v), (RARE, 1.0 - RARE)) for n, v in held.items() if v}
-        return cls({name: (float(f"{a:.4g}"), float(f"{b:.4g}")) for name, (a, b) in ends.items()}) if ends else None
+        if not ends:
+            return None
+        balls = {RADIUS: (min(radii), max(radii))} if radii else {}
+        return cls(balls | {name: (float(f"{a:.4g}"), float(f"{b:.4g}")) for name, (a, b) in ends.items()})
+
+    def nearest_radius(self, radius: float) -> float | None:
+        """m, the radius nearest to another one among those of its balls; None where they are not known."""
+        return float(np.clip(radius, *self.ranges[RADIUS])) if RADIUS in self.ranges else None
 
     def to_mapping(self) -> dict[str, list[float]]:
         """The section of a model file."""

@@ -54,7 +54,8 @@ class BallModel(nn.Module, ABC):
         variations: coefficients that differ between tracks, by name as in `named_parameters()`.
         spins: the spins of groups of shots; None if unknown.
         domain: the speeds, spins and places of the tracks that it was fitted on; None if unknown.
-        learned_from: m, radius of the ball whose tracks taught its networks, if that is another ball; else None.
+        learned_from: m, radius of the ball whose tracks taught its networks or coefficients, if that is another ball;
+            else None.
         random: True if the model draws random numbers, so that the same state has another future each time; machine
             code then uses its `in_flight`.
 

@@ -43,7 +43,8 @@ def load_model(
     Args:
         path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `populations`, `domain`,
             `learned` (docs/models.md).
-        radius: m, of the ball, usually from the dataset; None: that which networks learned from, else 0.02.
+        radius: m, of the ball, usually from the dataset; None: that of the ball that the model was fitted on or that
+            networks learned from, else 0.02.
         inertia_factor: moment of inertia divided by m R^2.
         room: name of the dataset to estimate. In a room outside of its training a network that fades keeps half of its
             correction, or nothing if that did not help held-out training tracks. None: as trained.
@@ -62,8 +63,7 @@ def load_model(
     content = read_yaml(path)
     learned = content.get("learned") if isinstance(content, Mapping) else None
     if learned is None:
-        size = RADIUS if radius is None else radius
-        return model_from_dict(content, radius=size, inertia_factor=inertia_factor, where=str(path))
+        return _analytic(content, radius, inertia_factor, str(path))
     beside = isinstance(learned, str) and learned not in (".", "..") and Path(learned).name == learned
     if not beside or not 0 < len(learned) <= LONGEST_NAME:
         raise ValueError(
@@ -80,6 +80,19 @@ def load_model(
     abroad = room is not None and model.trained is not None and model.trained.is_foreign(room)
     if abroad and isinstance(model, LearnedModel) and model.fading is not None:
         model.fading.strength = float(model.fading.get_buffer("abroad"))
+    return model
+
+
+def _analytic(content: Any, radius: float | None, inertia_factor: float, where: str) -> AnalyticModel:
+    """The model of a file without a learned part, for the ball that it was fitted on where no radius is given."""
+    from ballfg.dynamics.nominal import TOLERANCE  # which reads model files
+
+    domain = _domain(content.get(DOMAIN), where) if isinstance(content, Mapping) else None
+    fitted = None if domain is None else domain.nearest_radius(RADIUS if radius is None else radius)
+    size = next(r for r in (radius, fitted, RADIUS) if r is not None)
+    model = model_from_dict(content, radius=size, inertia_factor=inertia_factor, where=where)
+    if fitted is not None and abs(size / fitted - 1.0) > TOLERANCE:
+        model.learned_from = fitted
     return model
 
 

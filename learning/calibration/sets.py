@@ -109,7 +109,8 @@ def calibrate_sets(config: CalibrationConfig, folder: Path, *, resume: bool, job
             raise
         abroad = Abroad.of(sets)
         found = abroad.model(model)
-        found.domain = Domain.of(track for one in datasets if isinstance(one, Dataset) for track in one)
+        every = (track for one in datasets if isinstance(one, Dataset) for track in one)
+        found.domain = Domain.of(every, [one.info.ball.radius for one in datasets if isinstance(one, Dataset)])
         pairs = {one.name: _judged(one, [other for other in sets if other is not one], watch) for one in sets}
         gain = _gain([pair for each in pairs.values() for pair in each])
         save_model(found, folder / files.MODEL)

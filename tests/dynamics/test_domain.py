@@ -9,6 +9,7 @@ import pytest
 
 from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.dynamics.domain import Domain
+from ballfg.prediction.c_header import c_header
 from ballfg.tracks import Track
 
 
@@ -46,6 +47,21 @@ def test_a_model_file_keeps_it(tmp_path: Path) -> None:
     (tmp_path / "model.yaml").write_text(text.replace("- 1.5", "- 15"))
     with pytest.raises(ValueError, match="pairs of growing numbers"):
         load_model(tmp_path / "model.yaml")
+
+
+def test_a_file_knows_the_ball_that_its_model_was_fitted_on(tmp_path: Path) -> None:
+    """Where nobody states the ball, as for a header in C; a ball of another size is a doubt."""
+    model = nominal_model("tennis")
+    model.domain = Domain.of([_moving(2.0)], [0.033, 0.034])
+    save_model(model, path := tmp_path / "model.yaml")
+    assert load_model(path).radius == 0.033  # the nearest to a ball that nobody states
+    assert "{0.0, -INFINITY, 0.033," in c_header(load_model(path), "ball")
+    assert (load_model(path, radius=0.0335).radius, load_model(path, radius=0.0335).learned_from) == (0.0335, None)
+    assert (load_model(path, radius=0.02).radius, load_model(path, radius=0.02).learned_from) == (0.02, 0.033)
+    assert load_model(path, radius=0.037).learned_from is None  # as near as balls of one kind are
+    save_model(load_model(path, radius=0.02), path)
+    assert load_model(path).radius == 0.033
+    assert Domain.of([], [0.02]) is None
 
 
 @pytest.mark.parametrize("ranges", [{"colour": (0.0, 1.0)}, {"speed": (1.0,)}, {"speed": 3.0}, {"speed": (2.0, 1.0)}])
