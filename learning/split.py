@@ -22,7 +22,7 @@ FIT, JUDGE, VALIDATE = "train", "test", "validation"
 class Split:
     """The parts of a dataset: names of the tracks that are fitted and that judge, reasons for the others by name.
 
-    The digest is a hash of all stamps, positions, sigmas and labels.
+    The digest is a hash of all stamps, positions, sigmas and labels, and of what is known of ball, table and noise.
     """
 
     fit: tuple[str, ...]
@@ -43,7 +43,9 @@ def split_tracks(
     """
     if how == "label" and LABEL not in dataset.label_names:
         raise ValueError(f"split 'label' needs a column '{LABEL}' in labels.csv; there is none. Use split: random.")
-    digest = hashlib.sha256()
+    info, digest = dataset.info, hashlib.sha256()
+    known = info.ball, info.table_height, info.table_extent, info.position_noise, info.spin_noise, info.noise
+    digest.update(repr(known).encode())
     taken: dict[str, str] = {}
     left_out: dict[str, str] = {}
     for track in dataset:

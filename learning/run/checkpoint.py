@@ -24,7 +24,7 @@ TENSORS = ("weights", "optimizer", "memory", "best")  # One file `<name>.safeten
 
 
 class RunProgress(BaseModel):
-    """Numbers of finished epochs, of the best epoch, of steps skipped in a row up to now, and of tracks."""
+    """Numbers of finished epochs, of the best epoch, of steps skipped in a row up to now, of tracks; the data."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
@@ -34,6 +34,7 @@ class RunProgress(BaseModel):
     skipped_in_row: int
     train: int
     validation: int
+    data: str | None = None  # Digest of the datasets' files (`data_digest`); None: earlier versions did not keep it
 
 
 @dataclass(frozen=True)

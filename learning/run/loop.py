@@ -13,10 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ballfg.checks import listed
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.ranks import Ranks, SharedMemory
+from ballfg.learning.run.run_folder import data_digest
 from ballfg.learning.trainee import BatchLoss, Trainee
 from ballfg.progress import Watch
 
@@ -74,6 +76,7 @@ class Training:
         self.best = _weights(self.module)
         self.memory = SharedMemory()
         self.skipped_in_row = 0
+        self.data = data_digest(task.config.data or ())
         if checkpoint is not None:
             self._restore(checkpoint)
 
@@ -211,6 +214,7 @@ class Training:
             skipped_in_row=self.skipped_in_row,
             train=len(self.task.train),
             validation=len(self.task.validation),
+            data=self.data,
         )
 
     def _rate(self, epoch: int, index: int) -> float:
@@ -232,6 +236,11 @@ class Training:
             raise ValueError(
                 f"the checkpoint must be of the same tracks; it has {there[0]} to train and {there[1]} to validate, "
                 f"the data {here[0]} and {here[1]}. Give the same data, or start a new run."
+            )
+        if progress.data not in (None, self.data):
+            raise ValueError(
+                f"the checkpoint must be of the same data; dataset.yaml or a table of {listed(task.config.data or ())} "
+                "has changed since. Restore it, or start a new run."
             )
         try:
             self.module.load_state_dict(checkpoint.weights)

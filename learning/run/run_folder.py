@@ -1,7 +1,8 @@
 """Checks and prepares the folder of a run: names of its files, config and versions."""
 
+import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from ballfg.files.whole_file import write_text
 from ballfg.files.whole_folder import reserved
 from ballfg.learning.config.config_file import Config, read_config
 from ballfg.machine import versions
+from ballfg.tracks.info import INFO_FILE
 
 CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
 STEPS, REPORT, PICTURE = "checkpoint.json", "report.json", "calibration.png"
@@ -22,6 +24,7 @@ PAGE = "training.html"
 CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)  # Files of a calibration
 TRAINING = (CONFIG, VERSIONS, MODEL, CHECKPOINT, METRICS, CURVES, EVENTS, PAGE)
 """Files and folders of a training; a learned model adds a folder of its own."""
+TABLES = ("tracks", "labels")  # Of a dataset
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "safetensors")
 
 
@@ -71,6 +74,18 @@ def running(folder: Path, config: Config, *, resume: bool) -> Iterator[None]:
         for path in made:
             if path.is_dir() and not any(path.iterdir()):
                 path.rmdir()
+
+
+def data_digest(folders: Sequence[str]) -> str:
+    """A hash of datasets: of their files `dataset.yaml`, `tracks` and `labels`."""
+    digest = hashlib.sha256()
+    for folder in map(Path, folders):
+        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+            if path.name == INFO_FILE or path.stem in TABLES:
+                digest.update(f"{path.name} {path.stat().st_size} ".encode())
+                with path.open("rb") as file:
+                    digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
 def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

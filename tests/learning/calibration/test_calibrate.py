@@ -27,7 +27,7 @@ from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_track, summary
 from ballfg.learning.split import split_tracks
 from ballfg.progress import unwatched
-from ballfg.tracks import read_dataset, write_dataset
+from ballfg.tracks import Ball, read_dataset, write_dataset
 from ballfg.tracks.noise import TrackNoise
 from tests.learning.conftest import PLANTED
 
@@ -162,7 +162,10 @@ def test_splits(few_tracks: Path, tmp_path: Path) -> None:
         given = dataset if scale is None else (replace(t, sigmas=scale * t.sigmas) for t in rough)
         write_dataset(tmp_path / name, dataset.info, given, "csv")
         digests.add(split_tracks(read_dataset(tmp_path / name), "random", 0, needs_spin=False).digest)
-    assert len(digests) == 3  # a training on the same positions with other errors is another one
+    for k, change in enumerate(({"position_noise": 0.01}, {"ball": Ball(0.021, 0.0027)}, {"table_height": 0.01})):
+        write_dataset(tmp_path / str(k), replace(dataset.info, **change), dataset, "csv")
+        digests.add(split_tracks(read_dataset(tmp_path / str(k)), "random", 0, needs_spin=False).digest)
+    assert len(digests) == 6  # a training on the same positions with other errors, or another ball, is another one
     with pytest.raises(ValueError, match="needs a column 'split'"):
         split_tracks(dataset, "label", 0, needs_spin=False)
 

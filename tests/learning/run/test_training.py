@@ -18,6 +18,7 @@ from ballfg.learning.config.training import OptimizerConfig, TrainConfig
 from ballfg.learning.run import record, run_folder as files, training
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_metrics
+from ballfg.simulation import SimulationConfig, write_simulation
 
 
 def pass_on(items: Iterable[list[int]], _total: int, _what: str) -> Iterator[list[int]]:
@@ -31,6 +32,23 @@ def config(*, epochs: int = 4, seed: int = 3, data: str = "plain", **fields: Any
 
 def run(settings: TrainConfig, folder: Path, *, resume: bool = False) -> None:
     training.run_training(settings, folder, resume=resume, watch=pass_on)
+
+
+@pytest.mark.parametrize("changed", ["tracks.csv", "labels.csv", "dataset.yaml"])
+def test_a_run_is_not_continued_with_other_data(changed: str, tmp_path: Path) -> None:
+    """Its errors before and after would be those of different tracks. What else lies in the folder does not matter."""
+    data = str(tmp_path / "shots")
+    write_simulation(data, SimulationConfig(tracks=1, rate=60.0, seed=1))
+    run(config(epochs=1, data=data), tmp_path / "run")
+    (tmp_path / "shots" / "predictions.csv").write_text("a result")
+    run(config(epochs=2, data=data), tmp_path / "run", resume=True)
+    with (tmp_path / "shots" / changed).open("a") as file:
+        file.write("\n")
+    with pytest.raises(ValueError, match=r"of the same data; dataset\.yaml or a table of .*shots.* has changed since"):
+        run(config(epochs=3, data=data), tmp_path / "run", resume=True)
+    kept = read_checkpoint(tmp_path / "run")
+    assert kept is not None
+    assert kept.progress.epoch == 2
 
 
 @pytest.fixture(scope="module")
