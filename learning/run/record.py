@@ -104,7 +104,7 @@ class Record:
             judged = task.trainee.without_training(task.validation) if task.validation else None
             points = 0 if judged is None else judged.points
             untrained = math.sqrt(judged.squared_error / points) if judged is not None and points else None
-            beside = beside_untrained(epochs, progress.best_epoch, untrained)
+            beside = f"{beside} {beside_untrained(epochs, progress.best_epoch, untrained)}".strip()
         self._write_page(model, self.median_shot() if gains else None, beside)
         better = gains and improved(epochs, progress.best_epoch)
         print(verdict(epochs, progress.best_epoch))
@@ -135,11 +135,14 @@ class Record:
     def _export(self) -> tuple[Path, str, bool]:
         """Write the model: the network, or the calibrated one that it started from if it does not surely beat it.
 
-        Returns: its path, a sentence on the comparison, which is empty without one, and False for the calibrated model.
+        Returns: its path, a sentence on which model that is or on the comparison, or an empty one, and False for the
+            calibrated model.
         """
         path = self.training.task.trainee.export(self.folder)
         if self.start is None:
-            return path, "", True
+            progress = self.training.progress
+            first = progress is not None and improved(self.epochs, progress.best_epoch) is False
+            return path, "The model file holds the model before the first step." if first else "", True
         choice = self.start.compare(path)
         gains = choice is not None and choice.chosen == NETWORK
         if not gains:

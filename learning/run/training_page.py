@@ -59,7 +59,7 @@ def verdict(epochs: Sequence[Epoch], best_epoch: int) -> str:
     least = f"After it the best was {min(later):.1f} mm." if later else "None of the later models could be judged."
     return (
         f"The training did not help: the model before the first step predicts validation tracks best, to "
-        f"{errors[0]:.1f} mm. {least} The model file holds the model before the first step."
+        f"{errors[0]:.1f} mm. {least}"
     )
 
 

@@ -69,6 +69,7 @@ def test_a_network_that_gains_nothing_leaves_the_calibrated_model(refused: tuple
     assert isinstance(calibrated, AnalyticModel)
     assert model_to_dict(written) == model_to_dict(calibrated)
     assert "does not surely predict better than the calibrated model, which the model file holds" in page
+    assert "holds the model before the first step" not in page  # one word on what the file holds
     # epoch 0, the best one, is the calibration with its doubts
     assert "the log score changes by +0.000 ± 0.000" in page
     drag = float(dict(written.named_parameters())["flight.drag.k"].detach())
