@@ -1,5 +1,6 @@
 """Finds a camera's pose from world points in its image, such as the table's corners."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -45,7 +46,7 @@ class Extrinsics:
     def chance(self) -> float:
         """Probability that the noise of the marks alone makes residuals as large as these."""
         freedom = 2 * len(self.marked.points) - POSE
-        return float(chi2.sf(_squares(self.camera, self.marked), freedom))
+        return float(chi2.sf(squares(self.camera, self.marked), freedom))
 
     @property
     def turn_sigma(self) -> float:
@@ -71,21 +72,43 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
         for points out of a plane G. Terzakis, M. Lourakis, "A consistently fast and globally optimal solution to the
         perspective-n-point problem", ECCV 2020 (SQPNP).
     """
-    where, flat = f"camera {shown(lens.name)}", _check_points(lens, marked)
-    poses = sorted(_poses(lens, marked, flat), key=lambda camera: _squares(camera, marked))
+    found = likely_poses(lens, marked)
+    check_one(found, [squares(camera, marked) for camera in found], marked)
+    best = Extrinsics(found[0], marked, np.zeros((6, 6)))
+    return replace(best, covariance=_covariance(best))
+
+
+def likely_poses(lens: Camera, marked: Marked) -> list[Camera]:
+    """The lens at each place that could be meant, best first. Raises: ValueError: as `calibrate_extrinsics`."""
+    flat = _check_points(lens, marked)
+    poses = sorted(_poses(lens, marked, flat), key=lambda camera: squares(camera, marked))
     above = [camera for camera in poses if not flat or _is_above(camera, marked.points)]
     if not above:
-        problem = f"{where}: points must be seen from above; these are mirrored, as if seen from below"
-        raise ValueError(f"{problem}. Swap left and right, or correct the points.")
-    best = Extrinsics(above[0], marked, np.zeros((6, 6)))
+        rule = "points must be seen from above; these are mirrored, as if seen from below"
+        raise ValueError(f"camera {shown(lens.name)}: {rule}. Swap left and right, or correct the points.")
+    return [camera for i, camera in enumerate(above) if not any(_alike(camera, better) for better in above[:i])]
+
+
+def _alike(one: Camera, other: Camera) -> bool:
+    """True if two poses of a camera stand at the same place."""
+    return bool(np.linalg.norm(one.centre - other.centre) <= FLAT * np.linalg.norm(other.tvec))
+
+
+def check_one(cameras: Sequence[Camera], costs: Sequence[float], marked: Marked) -> None:
+    """Refuses poses of which the best does not explain the points, or another one explains them as well.
+
+    Args: cameras: best first.  costs: of each, a sum of squared whitened residuals.
+    Raises: ValueError.
+    """
+    best = Extrinsics(cameras[0], marked, np.zeros((POSE, POSE)))
+    where = f"camera {shown(best.camera.name)}"
     if best.rms > (most := MAX_RMS * marked.sigma):
         problem = f"{where}: points must be explained within {most:g} px; got {best.rms:.1f}"
         raise ValueError(f"{problem}. {_culprit(best)}Check names and pixels, and that the lens is this camera's.")
-    alike = [camera for camera in above[1:] if _squares(camera, marked) - _squares(above[0], marked) < CLEARLY]
-    if any(np.linalg.norm(above[0].centre - c.centre) > FLAT * np.linalg.norm(above[0].tvec) for c in alike):
+    rivals = [camera for camera, cost in zip(cameras, costs, strict=True) if cost - costs[0] < CLEARLY]
+    if not all(_alike(rival, best.camera) for rival in rivals):
         problem = f"{where}: points must tell one pose; two explain them alike"
         raise ValueError(f"{problem}. Mark more points, farther apart or at other heights.")
-    return replace(best, covariance=_covariance(best))
 
 
 def _check_points(lens: Camera, marked: Marked) -> bool:
@@ -154,10 +177,16 @@ def _starts(lens: Camera, marked: Marked, flat: bool) -> list[tuple[Array, Array
     return starts
 
 
-def _squares(camera: Camera, marked: Marked) -> float:
+def squares(camera: Camera, marked: Marked) -> float:
     """Sum of squared whitened residuals; infinite where a point cannot be seen."""
     total = float(((camera.project(marked.points) - marked.pixels) ** 2).sum() / marked.sigma**2)
     return total if np.isfinite(total) else np.inf
+
+
+def noise_shown(camera: Camera, marked: Marked) -> float:
+    """px, the standard deviation of the marks as stated, or as the residuals at a fitted pose show, if that is more."""
+    freedom = 2 * len(marked.points) - POSE
+    return marked.sigma * max(1.0, float(np.sqrt(squares(camera, marked) / freedom)))
 
 
 def _is_above(camera: Camera, points: Array) -> bool:
@@ -195,7 +224,5 @@ def _covariance(found: Extrinsics) -> Array:
     turns = np.stack(axes, axis=1) / 2.0
     centres = np.stack([-by_r.T @ camera.tvec for by_r in slopes], axis=1)
     moved = np.block([[turns, np.zeros((3, 3))], [centres, -rotation.T]])
-    freedom = 2 * len(marked.points) - 6
-    shown = found.rms * np.sqrt(len(marked.points) / freedom)  # rms is of distances: two numbers a point
-    sigma = max(marked.sigma, shown)
+    sigma = noise_shown(camera, marked)
     return np.asarray(sigma**2 * moved @ np.linalg.inv(by_pose.T @ by_pose) @ moved.T)

@@ -44,6 +44,33 @@ def test_covariances_are_those_of_the_scatter() -> None:
     assert low < np.mean(squares) < high
 
 
+def whitened_square(camera: Camera, found: Camera) -> float:
+    zoom = np.log(found.matrix[0, 0] / camera.matrix[0, 0])
+    error = np.concatenate((-turned(camera, found), found.centre - camera.centre, [zoom]))
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+def test_marks_that_are_worse_than_stated_widen_the_covariance() -> None:
+    """Nine points at 1 px, stated to 0.5 px: chi-square with the noise stated has a mean of four times seven."""
+    camera, rng, squares = standing(PLACES[1]), np.random.default_rng(0), []
+    for _ in range(60):
+        seen = replace(shaken(marked(camera, tuple(AT), 1.0), rng), sigma=0.5)
+        found = pose_and_focal(grown(camera, 0.05 * rng.standard_normal()), seen, 0.05)
+        assert found.marked.sigma == 0.5
+        squares.append(whitened_square(camera, found.camera))
+    assert np.mean(squares) < 14.0
+
+
+def test_a_focal_length_known_to_a_fifth_is_found_wherever_it_is() -> None:
+    """Nine points at 0.5 px are not explained at focal lengths that are tried, and at the one between them they are."""
+    camera, rng, squares = standing(PLACES[0]), np.random.default_rng(0), []
+    for zoom in np.linspace(-0.4, 0.4, 41):
+        found = pose_and_focal(grown(camera, zoom), shaken(marked(camera, tuple(AT)), rng), 0.2).camera
+        assert abs(np.log(found.matrix[0, 0] / camera.matrix[0, 0])) < 0.1
+        squares.append(whitened_square(camera, found))
+    assert np.mean(squares) < chi2.ppf(0.999, 7 * 41) / 41
+
+
 @pytest.mark.parametrize(("names", "off"), [(CORNERS, 0.06), (tuple(AT), 0.04)])
 def test_residuals_beyond_the_noise_are_noted(names: tuple[str, ...], off: float) -> None:
     """Chances of right lenses are even; a wrong focal length has hardly one, and with its sigma it has again."""
