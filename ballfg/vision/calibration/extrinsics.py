@@ -219,8 +219,8 @@ def _covariance(found: Extrinsics) -> Array:
     by_pose = slopes_of(camera, marked.points, camera.rvec, camera.tvec)[:, :POSE]
     rotation, slope = cv2.Rodrigues(camera.rvec)
     slopes = np.asarray(slope, dtype=np.float64).reshape(3, 3, 3)  # of the rotation, by the three of rvec
-    skews = [rotation.T @ by_r for by_r in slopes]
-    axes = [np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) for skew in skews]
+    skews = [rotation.T @ by_r for by_r in slopes]  # of the inverse of the turn, as in `changed`
+    axes = [np.array([skew[1, 2] - skew[2, 1], skew[2, 0] - skew[0, 2], skew[0, 1] - skew[1, 0]]) for skew in skews]
     turns = np.stack(axes, axis=1) / 2.0
     centres = np.stack([-by_r.T @ camera.tvec for by_r in slopes], axis=1)
     moved = np.block([[turns, np.zeros((3, 3))], [centres, -rotation.T]])

@@ -96,7 +96,7 @@ def test_covariance_is_the_scatter(names: tuple[str, ...]) -> None:
     squares = []
     for _ in range(200):
         found = calibrate_extrinsics(camera, shaken(marked(camera, names), rng))
-        error = np.concatenate((turned(camera, found.camera), found.camera.centre - camera.centre))
+        error = np.concatenate((-turned(camera, found.camera), found.camera.centre - camera.centre))
         squares.append(error @ np.linalg.solve(found.covariance, error))
     assert 5.0 < np.mean(squares) < 7.0
 

@@ -61,6 +61,17 @@ def test_marks_that_are_worse_than_stated_widen_the_covariance() -> None:
     assert np.mean(squares) < 14.0
 
 
+def test_covariances_of_both_ways_agree() -> None:
+    """A focal length known to 1e-4 is as good as an exact lens: turns and moves are correlated alike."""
+    seen = shaken(marked(standing(PLACES[1]), tuple(AT), 1.0), np.random.default_rng(0))
+    alone, both = (
+        found.covariance
+        for found in (calibrate_extrinsics(standing(PLACES[1]), seen), pose_and_focal(standing(PLACES[1]), seen, 1e-4))
+    )
+    sigmas = np.sqrt(np.diag(alone))
+    np.testing.assert_allclose(both / np.outer(sigmas, sigmas), alone / np.outer(sigmas, sigmas), atol=0.01)
+
+
 def test_a_focal_length_known_to_a_fifth_is_found_wherever_it_is() -> None:
     """Nine points at 0.5 px are not explained at focal lengths that are tried, and at the one between them they are."""
     camera, rng, squares = standing(PLACES[0]), np.random.default_rng(0), []
