@@ -184,6 +184,21 @@ def test_of_a_time_shift_nothing_changes(ball: World) -> None:
         np.testing.assert_allclose(c.states, a.states, rtol=1e-4, atol=1e-3)
 
 
+@pytest.mark.parametrize("up", [4.0, -6.0])
+def test_of_a_worlds_origin_nothing_changes(ball: World, up: float) -> None:
+    """A table at 4.76 m, as over a marker in a cellar, has as much room above it as one at 0.76 m."""
+    times, states = rally(ball)
+    found, shift = seen(times, states, 5), np.array([10.0, -5.0, up])
+    camera = replace(SIDE, tvec=SIDE.tvec - SIDE.rotation @ shift)
+    ends = (8.63, 11.37, -5.76, -4.24)
+    moved = replace(ball.surfaces, table_height=TABLE + up, floor_height=up, extent=ends)
+    one = track_one_camera(found, SIDE, ball.model, ball.surfaces)
+    other = track_one_camera(found, camera, ball.model, moved)
+    assert len(one.estimates) == len(other.estimates) == 3
+    for a, b in zip(one.estimates, other.estimates, strict=True):
+        np.testing.assert_allclose(b.states[:, :3] - shift, a.states[:, :3], atol=1e-3)
+
+
 def test_a_light_that_glides_is_no_evidence_of_a_ball_but_a_flight_is(ball: World) -> None:
     times, states = rally(ball)
     found, pinhole = without_lens(seen(times, states, 3), SIDE)

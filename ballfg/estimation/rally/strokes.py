@@ -165,9 +165,10 @@ class Grower:
             return True
         positions, spread = self.places_of(stroke.path, times)
         half, middle = 0.5 * (ends[:, 1] - ends[:, 0]), ends.mean(axis=1)
-        floor = -half[1] if self.scene.surfaces.floor_height is None else self.scene.surfaces.floor_height
+        table, floor = self.scene.surfaces.table_height, self.scene.surfaces.floor_height
+        floor = table - half[1] if floor is None else floor
         low = np.append(middle - half * ROOM[:2], floor)
-        high = np.append(middle + half * ROOM[:2], ROOM[2] * half[1])
+        high = np.append(middle + half * ROOM[:2], table + ROOM[2] * half[1])
         slack = 2.0 * np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
         return bool(((positions > low - slack) & (positions < high + slack)).all())
 
