@@ -318,6 +318,30 @@ def test_one_camera_gives_states(one_view: Path, tmp_path: Path, capsys: pytest.
     assert '"cameras":[{"name":"right"' in page.replace(" ", "")
 
 
+def test_a_table_elsewhere_in_the_cameras_world_is_stated(one_view: Path, tmp_path: Path) -> None:
+    """One camera, calibrated in a world with the origin on the table's middle: its ends are not those of ballfg's."""
+    scene, out, rng = one_view, tmp_path / "shots", np.random.default_rng(0)
+    shift = np.array([-1.37, 0.0, -0.76])
+    (own,) = read_cameras(scene / "cameras.yaml")
+    write_cameras(tmp_path / "cameras.yaml", [replace(own, tvec=own.tvec - own.rotation @ shift)])
+    with (scene / "visible.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["camera"] == own.name and row["whole"] == "1"]
+    with (tmp_path / "seen.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("t", "camera", "u", "v", "sigma_u", "sigma_v"))
+        for row in rows:
+            pixel = np.array([float(row["u"]), float(row["v"])]) + 0.3 * rng.standard_normal(2)
+            writer.writerow((row["t"], own.name, *pixel.tolist(), 0.3, 0.3))
+    words = (tmp_path / "seen.csv", "--cameras", tmp_path / "cameras.yaml", "--out", out, "--no-overlay")
+    assert status("track", *words, "--table-height", 0, "--table", "x=-1.37..1.37, y=-0.7625..0.7625") == 0
+    assert "x:\n    - -1.37\n    - 1.37\n    y:\n    - -0.7625\n" in (out / "dataset.yaml").read_text(encoding="utf-8")
+    truth, found = (numbers(path, "t", "x", "y", "z") for path in (scene / "truth.csv", out / "states.csv"))
+    assert len(truth) == len(found) == 2
+    for flown, estimated in zip(truth.values(), found.values(), strict=True):
+        error = estimated[:, 1:] - shift - at(flown, estimated[:, 0])
+        assert np.sqrt((error**2).sum(axis=1).mean()) < 0.08
+
+
 def at(flown: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Truth, sampled every millisecond, at other times."""
     return np.column_stack([np.interp(times, flown[:, 0], column) for column in flown[:, 1:].T])
@@ -344,6 +368,10 @@ def test_bad_videos_are_refused(rig: Path, tmp_path: Path, capsys: pytest.Captur
     words = ("--cameras", rig, "--out", out, "--jobs", 1)
     alone = refused(capsys, left, "--out", out, "--time-offsets")
     assert "--time-offsets must not be given without --cameras. Leave it out." in alone
+    for text in ("2.74x1.525", "x=0..2.74", "x=0..2.7.4,y=-1..1"):
+        said = refused(capsys, left, middle, right, *words, "--table", text)
+        assert f"table must read x=LOW..HIGH,y=LOW..HIGH, m; got '{text}'. Write for instance" in said
+    assert "frame.table.y must increase" in refused(capsys, left, middle, right, *words, "--table", "x=0..1,y=1..-1")
     assert "got none for 'middle'. Give it as middle=FILE, or leave the camera out with --without middle" in refused(
         capsys, left, right, *words
     )

@@ -64,6 +64,13 @@ def track(
     table_height: Annotated[
         float | None, typer.Option(help="Height of the table's surface, m.", show_default="that of the ball's table")
     ] = None,
+    table: Annotated[
+        str | None,
+        typer.Option(
+            help="Ends of the table in the cameras' world, m, as x=-1.37..1.37,y=-0.76..0.76.",
+            show_default="those of calibrate-cameras for one camera, else found later",
+        ),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Dataset name.", show_default="the folder's")] = None,
     overlay: Annotated[bool, typer.Option(help="Overlay video.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier result.")] = False,
@@ -90,6 +97,7 @@ def track(
     from ballfg.simulation.balls import ball_kind
     from ballfg.tracks.detections_file import EVENTS_FILE
     from ballfg.tracks.info import DatasetInfo
+    from ballfg.vision.calibration.table_points import table_ends
     from ballfg.vision.camera_file import read_cameras
     from ballfg.vision.detection.detections import read_detections
     from ballfg.vision.tracking import pipeline
@@ -98,7 +106,7 @@ def track(
     kind = ball_kind(ball)
     if cameras is None:
         given = {"stamps": stamps, "without": without, "colour": colour, "detector": detector}
-        _refuse_moving(**given, table_height=table_height, time_offsets=time_offsets)
+        _refuse_moving(**given, table_height=table_height, table=table, time_offsets=time_offsets)
         _moving_camera(recordings, out, kind, court, corners, candidates, name, jobs=jobs, force=force)
         return
     if (corners, candidates) != (None, None):
@@ -112,6 +120,9 @@ def track(
         floor = kind.surfaces.floor_height
         floor = None if floor is None else floor + height - kind.surfaces.table_height
         surfaces = replace(kind.surfaces, table_height=height, floor_height=floor)
+        if table is not None:
+            info = replace(info, table_extent=table_ends(table))
+            surfaces = replace(surfaces, extent=info.table_extent)
         if len(rig) != 1:
             pipeline.check_rig(rig)
         elif time_offsets:

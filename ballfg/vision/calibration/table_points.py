@@ -1,5 +1,6 @@
 """Defines points of a table-tennis table with known places, and reads their pixels from a file."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -51,6 +52,18 @@ def table_outline(height: float = TABLE_HEIGHT) -> list[Array]:
     corners = [at[name] for name in ("near_left", "far_left", "far_right", "near_right", "near_left")]
     edges = [np.stack(pair) for pair in pairwise(corners)]
     return [*edges, np.stack((at["near_middle"], at["far_middle"])), np.stack((at["net_left"], at["net_right"]))]
+
+
+def table_ends(text: str) -> tuple[float, float, float, float]:
+    """(x_low, x_high, y_low, y_high) m of a text such as `x=-1.37..1.37,y=-0.76..0.76`. Raises: ValueError."""
+    number = r"[-+]?[0-9.]+(?:e[-+]?[0-9]+)?"
+    found = re.fullmatch(rf"\s*x=({number})\.\.({number})\s*,\s*y=({number})\.\.({number})\s*", text)
+    try:
+        x_low, x_high, y_low, y_high = map(float, found.groups() if found else ())
+    except ValueError:
+        problem = f"table must read x=LOW..HIGH,y=LOW..HIGH, m; got {shown(text)}"
+        raise ValueError(f"{problem}. Write for instance x=-1.37..1.37,y=-0.76..0.76.") from None
+    return x_low, x_high, y_low, y_high
 
 
 @dataclass(frozen=True, eq=False)
