@@ -29,6 +29,10 @@ _NODES: Final = {
     "tvec": ("tvec",),
 }
 """This package's name of an array -> OpenCV's names of its node; the first is written, the others are read."""
+_FISHEYE, _NO_FISHEYE = "fisheye_model", ("0", "false")
+"""The node by which OpenCV's sample tells lenses of cv2.fisheye, whose four coefficients are others; what denies it."""
+_MODEL, _OPENCVS_LENSES = "distortion_model", ("plumb_bob", "rational_polynomial")
+"""The node by which ROS tells lenses apart, and its names of OpenCV's."""
 
 
 def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camera]:
@@ -170,7 +174,17 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
     return Camera(name, *own, covariance=fields.get("covariance"), **clock)
 
 
+def _check_lens(node: Mapping[str, Tree], where: str) -> None:
+    """Refuses coefficients that a file says are of another model than `Camera`'s. Raises: ValueError."""
+    stated, fisheye = node.get(_MODEL, "plumb_bob"), node.get(_FISHEYE, "0")
+    for name, value, fine in ((_FISHEYE, fisheye, _NO_FISHEYE), (_MODEL, stated, _OPENCVS_LENSES)):
+        if str(value).lower() not in fine:
+            rule = f"{where}: node {name!r} must be one of {', '.join(fine)}; got {shown(value)}"
+            raise ValueError(f"{rule}. Its coefficients mean something else: calibrate with --distortion 8.")
+
+
 def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:
+    _check_lens(node, where)
     if "image_size" in node:
         sides = np.ravel(numbers(node["image_size"], f"{where}: node 'image_size'"))
     elif "image_width" in node and "image_height" in node:

@@ -144,6 +144,14 @@ GOOD = "size: [1280, 720], matrix: [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]], 
             "%YAML:1.0\n---\ncamera_matrix: 3\n",
             "nodes 'image_width' and 'image_height' are required; got camera_matrix",
         ),
+        (
+            "%YAML:1.0\n---\ncamera_matrix: 3\nfisheye_model: 1\nimage_size: [1, 2]\n",
+            "node 'fisheye_model' must be one of 0, false; got '1'. Its coefficients mean something else",
+        ),
+        (
+            "%YAML:1.0\n---\ncamera_matrix: 3\ndistortion_model: equidistant\nimage_size: [1, 2]\n",
+            "node 'distortion_model' must be one of plumb_bob, rational_polynomial; got 'equidistant'",
+        ),
         ("%YAML:1.0\n---\ncamera_matrix: 3\nimage_size: [1.5, 2.]\n", "image's size must be two whole numbers"),
     ],
 )
@@ -153,6 +161,16 @@ def test_files_that_break_a_rule(tmp_path: Path, text: str, message: str) -> Non
     with pytest.raises(ValueError, match=message) as caught:
         read_cameras(file)
     assert str(caught.value).startswith(str(file))
+
+
+def test_a_file_that_denies_a_fisheye_is_read(tmp_path: Path) -> None:
+    """OpenCV's sample writes the node always."""
+    file = tmp_path / "left.xml"
+    write_opencv(file, [camera("left")])
+    text = file.read_text().replace("<image_width>", "<fisheye_model>0</fisheye_model><image_width>")
+    file.write_text(text)
+    assert "fisheye" in text
+    np.testing.assert_array_equal(read_cameras(file)[0].distortion, camera("left").distortion)
 
 
 def test_names_are_text_as_they_are_written(tmp_path: Path) -> None:
