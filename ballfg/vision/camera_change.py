@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.vision.camera import Camera
+from ballfg.vision.projection import CameraBank
 
 CHANGES: Final = 7
 """Three rad about the world's axes, three m of the centre, the logarithm of the ratio of focal lengths."""
@@ -43,6 +44,14 @@ def slopes_of(points: Array, centre: Array, change: Array) -> tuple[Array, Array
     by_point, away = np.eye(3) - skew(change[:, TURN]), points - centre - change[:, MOVE]
     moved = centre + (by_point @ away[..., None])[..., 0]
     return moved, by_point, np.concatenate((skew(away), -by_point), axis=2)
+
+
+def by_changes(camera: Camera, points: Array) -> tuple[Array, Array]:
+    """Derivatives of the pixels of points (n, 3) m by these (n, 2, 3) px/m, and by the camera's changes (n, 2, 7)."""
+    pixels, by_point = CameraBank([camera]).jacobian(points, np.zeros(len(points), dtype=np.int64))
+    *_, by_place = slopes_of(points, camera.centre, np.zeros((len(points), CHANGES)))
+    grown = pixels - camera.matrix[:2, 2]
+    return by_point, np.concatenate((by_point @ by_place, grown[..., None]), axis=2)
 
 
 def skew(vectors: Array) -> Array:

@@ -82,6 +82,21 @@ def test_detections_become_a_dataset(rig: Path, tmp_path: Path, capsys: pytest.C
     assert cv2.imread(str(out / "contact_sheet.png")) is not None
 
 
+def test_of_cameras_known_roughly_a_better_way_is_told(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    loose = [replace(one, covariance=np.diag(np.square([1e-3] * 3 + [3e-3] * 3 + [3e-3]))) for one in RIG[:2]]
+    write_cameras(rig, [*loose, RIG[2]])
+    words = ("--cameras", rig, "--no-overlay")
+    assert status("track", table(tmp_path / "detections.csv"), *words, "--out", tmp_path / "rough") == 0
+    assert "note: errors of cameras known roughly (left, middle) last in tracks.csv" in capsys.readouterr().err
+    write_cameras(rig, RIG)
+    assert status("track", tmp_path / "detections.csv", *words, "--out", tmp_path / "exact") == 0
+    assert capsys.readouterr().err == ""
+    (rough,), (exact,) = ([one.sigmas for one in read_dataset(tmp_path / name)] for name in ("rough", "exact"))
+    assert (np.median(rough, axis=0) > 1.5 * np.median(exact, axis=0)).any()
+
+
 def test_what_describes_the_dataset_can_be_given(rig: Path, tmp_path: Path) -> None:
     out = tmp_path / "shots"
     words = ("--name", "throws", "--table-height", 0.1, "--ball", "tennis", "--without", "middle")

@@ -147,7 +147,7 @@ def track(
             tracking = pipeline.track_detections(detections, rig)
         if time_offsets and tracking.balls:
             tracking = _on_one_clock(tracking, kind.model, surfaces)
-        print_notes(pipeline.blind_cameras(tracking))
+        print_notes([*pipeline.blind_cameras(tracking), *pipeline.uncertain_cameras(tracking)])
         if (doubt := pipeline.disagreement(tracking)) is not None:
             print_notes([doubt])
         info = replace(info, rate=tracking.rate)

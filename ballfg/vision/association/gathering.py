@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index, Mask
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.association.paths import Path, path
-from ballfg.vision.association.triangulate import triangulate
+from ballfg.vision.association.triangulate import Triangulated, triangulate
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
@@ -90,13 +90,36 @@ def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
     for camera, mine in enumerate(rows):
         if len(mine) and len(times):
             pixels[:, camera], covariances[:, camera] = footage.path(camera, mine).at(times)
-    made = triangulate(footage.cameras, pixels, covariances + footage.offset**2 * np.eye(2))
+    noisy = covariances + footage.offset**2 * np.eye(2)
+    made = triangulate(footage.cameras, pixels, noisy)
     found = np.isfinite(made.points).all(axis=1)
     used = made.used[found]
     noise = np.trace(covariances[found], axis1=2, axis2=3) / 2.0
     share = np.mean(noise / (noise + footage.offset**2), axis=1, where=used)
     track = path(times[found], made.points[found], made.covariances[found] * share[:, None, None])
-    return Gathered(tuple(rows), track, made.covariances[found], used.sum(axis=1).astype(np.int64))
+    spread = made.covariances[found] + _of_cameras(footage.cameras, made.rows(found), noisy[found])
+    return Gathered(tuple(rows), track, spread, used.sum(axis=1).astype(np.int64))
+
+
+def _of_cameras(cameras: Sequence[Camera], made: Triangulated, noise: Array) -> Array:
+    """(n, 3, 3) m^2, what the covariances of the cameras add to those of points, all of which exist.
+
+    A change of a camera moves its pixels, and a pixel moves the point by its gain P J' R^-1.
+
+    Args: noise: (n, c, 2, 2) px^2 of the pixels.
+    """
+    spread = np.zeros(made.covariances.shape)
+    for number, camera in enumerate(cameras):
+        rows = np.flatnonzero(made.used[:, number])
+        if camera.covariance is None or not len(rows):
+            continue
+        from ballfg.vision.camera_change import by_changes  # with torch, which exact cameras need not load
+
+        by_point, by_change = by_changes(camera, made.points[rows])
+        gain = made.covariances[rows] @ by_point.swapaxes(1, 2) @ np.linalg.inv(noise[rows, number])
+        moved = gain @ by_change
+        spread[rows] += moved @ camera.covariance @ moved.swapaxes(1, 2)
+    return spread
 
 
 def nearest(stamps: Array, times: Array) -> NDArray[np.intp]:

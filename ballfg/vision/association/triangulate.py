@@ -32,6 +32,10 @@ class Triangulated:
     residuals: Array
     """(n, c, 2) px, seen minus projected, including views that did not take part; NaN without a sighting."""
 
+    def rows(self, chosen: Mask) -> "Triangulated":
+        """Some of the rows."""
+        return Triangulated(self.points[chosen], self.covariances[chosen], self.used[chosen], self.residuals[chosen])
+
 
 @dataclass(frozen=True, eq=False)
 class _Views:

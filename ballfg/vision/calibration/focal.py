@@ -10,8 +10,7 @@ from ballfg.checks import check_range
 from ballfg.vision.calibration.extrinsics import Extrinsics, check_one, likely_poses, noise_shown, squares
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_change import CHANGES, ZOOM, changed, slopes_of
-from ballfg.vision.projection import CameraBank
+from ballfg.vision.camera_change import CHANGES, ZOOM, by_changes, changed
 
 ROUGHLY: Final = (1e-4, 0.3)  # Smallest and largest relative standard deviation of a focal length
 TRIED: Final = (0.0, -1.0, 1.0, -2.0, 2.0)
@@ -57,7 +56,8 @@ def _settled(camera: Camera, lens: Camera, marked: Marked, focal_sigma: float) -
     """The most probable camera near one, by Gauss-Newton, and the covariance (7, 7) of its changes."""
     cost = _cost(camera, lens, marked, focal_sigma)
     for _ in range(ROUNDS):
-        slope, missed = _slopes(camera, marked.points), marked.pixels - camera.project(marked.points)
+        slope = by_changes(camera, marked.points)[1].reshape(-1, CHANGES)
+        missed = marked.pixels - camera.project(marked.points)
         information = slope.T @ slope / marked.sigma**2
         pull = slope.T @ missed.ravel() / marked.sigma**2
         information[ZOOM, ZOOM] += focal_sigma**-2
@@ -85,11 +85,3 @@ def _cost(camera: Camera, lens: Camera, marked: Marked, focal_sigma: float) -> f
 def _zoom(lens: Camera, camera: Camera) -> float:
     """Logarithm of the ratio of a camera's focal length and the stated one."""
     return float(np.log(camera.matrix[0, 0] / lens.matrix[0, 0]))
-
-
-def _slopes(camera: Camera, points: Array) -> Array:
-    """(2 n, 7) px of the pixels of points (n, 3) m by the camera's changes."""
-    pixels, by_point = CameraBank([camera]).jacobian(points, np.zeros(len(points), dtype=np.int64))
-    *_, by_place = slopes_of(points, camera.centre, np.zeros((len(points), CHANGES)))
-    grown = pixels - camera.matrix[:2, 2]
-    return np.concatenate((by_point @ by_place, grown[..., None]), axis=2).reshape(-1, CHANGES)

@@ -167,6 +167,16 @@ def blind_cameras(tracking: Tracking) -> Iterator[str]:
             yield f"camera {shown(camera.name)} saw none of the balls. Check its stamps, its pose and its candidates."
 
 
+def uncertain_cameras(tracking: Tracking) -> Iterator[str]:
+    """A sentence if cameras have a covariance: it is in that of each point, but moves all points of a track alike."""
+    loose = [camera.name for camera in tracking.cameras if camera.covariance is not None]
+    if loose and len(tracking.cameras) > 1 and tracking.balls:
+        yield (
+            f"errors of cameras known roughly ({listed(loose)}) last in tracks.csv: estimates from it are too sure. "
+            "Use --from detections, which takes in the cameras' covariance."
+        )
+
+
 def disagreement(tracking: Tracking) -> str | None:
     """A sentence on the calibration; None if the cameras agree or too little was seen."""
     found = tracking.agreement

@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.gathering import SeenBall
-from ballfg.vision.detection.detections import Detections
-from tests.vision.filming import Shot, World, film, rig, shots, turned
+from ballfg.vision.calibration.focal import pose_and_focal
+from ballfg.vision.calibration.table_points import Marked, table_points
+from ballfg.vision.camera_change import ZOOM, changed
+from ballfg.vision.detection.detections import Candidates, Detections
+from tests.vision.filming import CENTRES, Shot, World, film, looking, rig, shots, turned
 from tests.vision.judging import judge
 
 CAMERAS = rig()
@@ -167,3 +171,30 @@ def test_refuses_what_does_not_go_together() -> None:
         AssociationSettings(least_score=2.0)
     with pytest.raises(ValueError, match="least_points must be at least 3; got 1"):
         AssociationSettings(least_points=1)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_covariances_of_points_hold_those_of_the_cameras(count: int) -> None:
+    """Rigs whose places and focal lengths came from the table's corners: squares of whitened errors are of chi-square.
+
+    The calibration is that of `pose_and_focal`, the pixels those of the true cameras.
+    """
+    times, squares, rng = np.arange(0.0, 0.3, 0.01), [], np.random.default_rng(0)
+    points = np.column_stack((0.4 + 4.0 * times, 0.3 - times, 1.1 + 1.2 * times - 4.905 * times**2))
+    corners = np.stack([table_points()[f"{end}_{side}"] for end in ("near", "far") for side in ("left", "right")])
+    wide = [[800.0, 0.0, 640.0], [0.0, 800.0, 360.0], [0.0, 0.0, 1.0]]
+    true = [looking(str(number), centre, matrix=wide) for number, centre in enumerate(CENTRES)]
+    for _ in range(25):
+        seen, cameras = [], []
+        for camera in true[:count]:
+            pixels = camera.project(points) + 0.1 * rng.standard_normal((len(times), 2))
+            shown = [Candidates.at(pixel[None], 0.1) for pixel in pixels]
+            seen.append(Detections.of_frames(camera.name, zip(times.tolist(), shown, strict=True)))
+            marks = camera.project(corners) + 0.5 * rng.standard_normal((4, 2))
+            lens = changed(camera, np.append(np.zeros(ZOOM), 0.05 * rng.standard_normal()))
+            cameras.append(pose_and_focal(lens, Marked(tuple("abcd"), corners, marks), 0.05).camera)
+        (ball,) = associate(seen, cameras)
+        middle = len(ball.times) // 2
+        error = ball.points[middle] - points[np.argmin(np.abs(times - ball.times[middle]))]
+        squares.append(error @ np.linalg.solve(ball.covariances[middle], error))
+    assert np.mean(squares) < chi2.ppf(0.999, 3 * 25) / 25
