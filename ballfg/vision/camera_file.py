@@ -14,6 +14,7 @@ from ballfg.checks import check_keys, check_path, did_you_mean, is_number, liste
 from ballfg.files.file_storage import ENDINGS, Tree, number, numbers, read_storage
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import whole_file, write_text
+from ballfg.tracks.checks import MAX_COORDINATE
 from ballfg.vision.camera import Camera
 
 CAMERAS_FILE: Final = "cameras.yaml"  # its name in the folder of a dataset or a scene
@@ -171,7 +172,11 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
             raise ValueError(f"{what}. Write it like 0.004 or 4.0e-3.")
     rvec, tvec = (np.zeros(3) if missing else fields[field] for field in POSE)
     own = ((sides[0], sides[1]), fields["matrix"], fields["distortion"], rvec, tvec)
-    return Camera(name, *own, covariance=fields.get("covariance"), **clock)
+    camera = Camera(name, *own, covariance=fields.get("covariance"), **clock)
+    if (away := float(np.linalg.norm(camera.tvec))) > MAX_COORDINATE:
+        what = f"{where}: tvec must be in m, at most {MAX_COORDINATE:g} m long; got {away:.4g}"
+        raise ValueError(f"{what}. It is probably in mm, as after squares in mm: divide by 1000.")
+    return camera
 
 
 def _check_lens(node: Mapping[str, Tree], where: str) -> None:
