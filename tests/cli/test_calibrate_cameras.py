@@ -14,7 +14,7 @@ import yaml
 from ballfg.cli.main import run
 from ballfg.vision import Camera
 from ballfg.vision.calibration.table_points import table_points
-from ballfg.vision.camera_file import read_cameras
+from ballfg.vision.camera_file import read_cameras, write_cameras
 from tests.vision.calibration.board_scenes import CHARUCO, TRUE, image_of, poses
 
 BOARD = ("--board", "charuco", "--squares", "8x6", "--square", 0.04, "--marker", 0.03)
@@ -109,6 +109,23 @@ def test_lenses_first_and_places_later(calib: Path, tmp_path: Path, capsys: pyte
     assert "focal length " in capsys.readouterr().out
     for lens, camera in zip(known, read_cameras(rough), strict=True):
         assert abs(np.log(camera.matrix[0, 0] / lens.matrix[0, 0])) < 3.0 * np.sqrt(camera.covariance[6, 6])
+
+
+def test_a_focal_length_that_was_found_roughly_stays_rough_after_a_move(tmp_path: Path) -> None:
+    """The covariance of the first place, 2 m away, is not that of the second."""
+    first = replace(standing("left"), covariance=np.diag(np.square([0.3] * 3 + [2.0] * 3 + [0.01])))
+    at = table_points()
+    shown = {name: standing("left").project(point).tolist() for name, point in at.items() if "middle" not in name}
+    write_cameras(tmp_path / "first.yaml", [first])
+    (tmp_path / "table.yaml").write_text(yaml.safe_dump({"cameras": {"left": shown}}))
+    words = ("--table", tmp_path / "table.yaml", "--out", tmp_path / "second.yaml")
+    assert status("--intrinsics", tmp_path / "first.yaml", *words) == 0
+    (second,) = read_cameras(tmp_path / "second.yaml")
+    sigmas = np.sqrt(np.diag(second.covariance))
+    assert 0.0005 < sigmas[6] <= 0.01
+    assert sigmas[:3].max() < 0.02
+    assert sigmas[3:6].max() < 0.05
+    assert np.linalg.norm(second.centre - CENTRES["left"]) < 1e-3
 
 
 def test_the_same_bytes_twice(calib: Path, tmp_path: Path) -> None:

@@ -162,13 +162,17 @@ def _lens(name: str, places: Iterable[str], board: "Board", distortion: int) -> 
 def _placed(
     camera: "Camera", lens: "Intrinsics | None", marked: "TableFile | None", focal_sigma: float | None
 ) -> "Calibration":
+    import numpy as np
+
     from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
-    from ballfg.vision.calibration.focal import pose_and_focal
+    from ballfg.vision.calibration.focal import ROUGHLY, pose_and_focal
     from ballfg.vision.calibration.report import Calibration
 
     if marked is None:
         return Calibration(camera, lens, None)
     points = marked.cameras[camera.name]
+    if focal_sigma is None and camera.covariance is not None:  # found with an earlier place, as well as it says
+        focal_sigma = float(np.clip(np.sqrt(camera.covariance[-1, -1]), *ROUGHLY))
     place = calibrate_extrinsics(camera, points) if focal_sigma is None else pose_and_focal(camera, points, focal_sigma)
     return Calibration(place.camera, lens, place)
 

@@ -65,7 +65,7 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
     Every pose that could be meant is refined: a flat target has two. One from which the points would be seen from
     below is not meant.
 
-    Args: lens: a camera; its pose has no part.  marked: at least four points, not in one line.
+    Args: lens: a camera; its pose and covariance have no part.  marked: at least four points, not in one line.
     Raises: ValueError: too few points or all in a line, none in the image, no pose that explains them, or two that
         do; the message names the camera.
     Source: T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014 (OpenCV's IPPE);
@@ -141,7 +141,7 @@ def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
     except cv2.error:
         refined = []
     cameras = [
-        replace(lens, rvec=np.ravel(rvec), tvec=np.ravel(tvec))
+        replace(lens, rvec=np.ravel(rvec), tvec=np.ravel(tvec), covariance=None)
         for rvec, tvec in refined
         if np.isfinite(rvec).all() and np.isfinite(tvec).all()
     ]
