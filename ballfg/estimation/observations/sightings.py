@@ -44,6 +44,9 @@ OFFSET_SETTLED: Final = 1e-5  # s. An offset that changes by less has converged:
 SAME_MOMENT: Final = 2e-4
 """s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at 20
 m/s^2 that is wrong by 0.4 um. States closer together would cost time without gain."""
+ROUNDING: Final = 1e-6
+"""s, by which moments of cameras in step may seem out of order: stamps less time offsets are rounded, and those since
+1970 are 0.24 us apart."""
 LEAST_SEEN: Final = 5  # Least number of sightings from one point: a flight has six unknowns, and noise must show
 LOOSE_DEPTH, LOOSE_SHARE = 0.5, 0.1
 """m, and share of the distance: standard deviation of the depth from which the status of an estimate says so. Where
@@ -298,13 +301,15 @@ def sighted_track(
     check_apart([rig[number] for number in np.unique(sightings.camera)])
     origin = float(sightings.times[0]) if len(sightings) else 0.0
     times = true_times_of(replace(sightings, times=elapsed(sightings.times, origin)), rig)
-    if (np.diff(times) < 0.0).any():
-        row = int(np.argmax(np.diff(times) < 0.0)) + 1
+    early = np.diff(times) < -ROUNDING
+    if early.any():
+        row = int(np.argmax(early)) + 1
         raise ValueError(
             f"track {shown(name)}: sightings must be in order of true time; row {row}, camera "
             f"{shown(sightings.cameras[sightings.camera[row]])}, is earlier than the one before. "
             "Sort them with `in_order`."
         )
+    times = np.maximum.accumulate(times)
     first, begun = np.ones(len(times), dtype=bool), times[0]  # those that begin a state of their own
     for row in range(1, len(times)):
         first[row] = times[row] - begun > SAME_MOMENT

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ballfg.checks import check_array, check_choice, shown
 from ballfg.estimation.observations.ray_path import AROUND, BEFORE, LOOSE, Path, Rays, filled, rough_path
-from ballfg.estimation.observations.sightings import SAME_MOMENT
+from ballfg.estimation.observations.sightings import ROUNDING, SAME_MOMENT
 from ballfg.estimation.online.state import Measurement, Sample
 from ballfg.factors.camera import CameraFactors
 from ballfg.factors.loss import Loss
@@ -62,11 +62,12 @@ class SightingStream:
         row = Sightings(tuple(self.cameras), np.array([number]), np.array([time]), pixel[None], covariance[None])
         true = float(own.true_times(row.times, row.pixels)[0])
         stamps = self._stamps[camera]
-        if true < self._last or (stamps and true <= stamps[-1]):
+        if true < self._last - ROUNDING or (stamps and true <= stamps[-1]):
             raise ValueError(
                 f"sightings must come in order of true time; got {true} s of camera {shown(camera)} after "
                 f"{self._last} s. Hold them back by a frame and sort them."
             )
+        true = max(true, self._last)
         stamps.append(true)
         self._last = true
         ray = Rays.of(row, np.array([true]), tuple(self.cameras.values()))

@@ -13,6 +13,7 @@ from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.observations.ray_path import BEFORE, SPEED, SPREAD, Rays, _robust, rough_path
 from ballfg.estimation.observations.rig import in_order
 from ballfg.estimation.observations.sightings import SAME_MOMENT, sighted_track, sightings_of
+from ballfg.estimation.online.online import Online
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
@@ -110,6 +111,28 @@ def test_between_takes_the_sightings_along(made: Scene) -> None:
     np.testing.assert_array_equal(seen.state, np.arange(37))
     np.testing.assert_allclose(seen.sightings.times - part.times, 0.0, atol=1e-12)
     assert "CameraSightings(37 of 37 samples)" in repr(part)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+@pytest.mark.parametrize("offset", [0.01, 0.0137, -0.1])
+def test_cameras_in_step_may_have_late_stamps(ball: World, start: float, offset: float) -> None:
+    """A stamp less its offset is rounded, so that of two equal moments either may come out first."""
+    stamps = start + 0.02 * np.arange(1, 31)
+    since = stamps - start
+    points = np.column_stack((-1.0 + 4.0 * since, 0.1 * since, 1.0 + 3.2 * since - 4.9 * since**2))
+    rig = (RIG[0], replace(RIG[1], time_offset=offset))
+    pixels = np.concatenate([camera.project(points) for camera in rig])
+    by, times = np.repeat([0, 1], 30), np.concatenate((stamps, stamps + offset))
+    sightings = in_order(Sightings(("left", "right"), by, times, pixels, np.tile(np.eye(2), (60, 1, 1))), rig)
+    track = sighted_track("a", sightings, rig)
+    assert len(track) == 30
+    np.testing.assert_allclose(track.times - track.times[0], since - since[0], atol=1e-6)
+    online = Online(ball.model, ball.surfaces, Settings(), cameras=rig)
+    for row in range(60):
+        camera = sightings.cameras[sightings.camera[row]]
+        now = online.push_sighting(float(sightings.times[row]), camera, sightings.pixels[row], np.eye(2))
+    assert now is not None
+    np.testing.assert_allclose(now.position, points[-1], atol=0.01)
 
 
 def test_refuses_what_is_no_track(made: Scene) -> None:
