@@ -5,7 +5,7 @@ spins have a mean and a spread of their own about each axis, which tell more tha
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
 import numpy as np
@@ -16,6 +16,7 @@ from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
 from ballfg.tracks.track import Label, label_text, level_of
 
 FASTEST: Final = 5000.0  # rad/s. Largest mean and spread; a larger one is in another unit
+UNSEEN: Final = ""  # Name of a group that no label has
 _FIELDS: Final = ("by", "groups")
 
 
@@ -78,12 +79,14 @@ class SpinPopulation:
         away = means - mean
         return mean, np.diag(share @ sigmas**2) + (share * away.T) @ away
 
-    def tells_of(self, group: str | None) -> bool:
-        """Whether it tells the spins of a group's shots. One group alone does not show how others differ from it.
+    def with_unseen(self, sigma: float) -> Self:
+        """The population with one group more, of shots that nobody has recorded: about zero, as many as of the others.
 
-        Args: group: its name; None: a track that names none, which may be of any group.
+        Args: sigma: rad/s, usual prior of each axis.
         """
-        return group is None or len(self.groups) > 1 or level_of(group, self.groups) is not None
+        tracks = max(1, round(sum(member.tracks for member in self.groups.values()) / len(self.groups)))
+        unseen = SpinGroup((0.0, 0.0, 0.0), (sigma,) * 3, tracks)
+        return replace(self, groups={**self.groups, UNSEEN: unseen})
 
     def check(self, group: str) -> None:
         """Refuses an unknown group. Raises: ValueError: if there is no such group."""
@@ -107,8 +110,7 @@ class SpinPopulation:
     @property
     def of_others(self) -> str:
         """The prior of tracks of no known group, in words."""
-        prior = "mixture of all its groups" if len(self.groups) > 1 else "usual prior of spins, not its only group's"
-        return f"the {prior}, {listed(self.groups)}"
+        return f"the mixture of its groups, {listed(self.groups)}, and of the usual prior"
 
     @classmethod
     def from_mapping(cls, content: Any) -> Self:

@@ -99,13 +99,10 @@ def _settings(dataset: Dataset | SightedDataset, model: BallModel, noises: Seque
 
 
 def _grouped(settings: Settings, dataset: Dataset | SightedDataset, spins: SpinPopulation) -> Settings:
-    """The settings with a model's groups; tracks without the label are the dataset's own group, as in training.
-
-    Where none has it, and that group is not the model's only one, they keep the usual prior.
-    """
+    """The settings with a model's groups; tracks without the label are the dataset's own group, as in training."""
     own = level_of(dataset.info.name, spins.groups)
-    if spins.by not in dataset.label_names and not spins.tells_of(dataset.info.name):
-        return settings
+    if own is None and spins.by not in dataset.label_names:
+        spins = spins.with_unseen(settings.spin_prior)
     return replace(settings, spins=spins, group=own)
 
 

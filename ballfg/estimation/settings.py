@@ -25,7 +25,7 @@ from ballfg.estimation.launcher import Launcher, SpinLabel, group_spin
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
-from ballfg.tracks.track import label_text
+from ballfg.tracks.track import label_text, level_of
 
 Solver = Literal["ballfg", "gtsam"]
 SOLVERS: Final[tuple[Solver, ...]] = get_args(Solver)
@@ -221,9 +221,10 @@ class Settings:
         label = None if self.launcher is None else self.launcher.label(track)
         if label is not None or self.spins is None:
             return label
-        own = track.labels.get(self.spins.by)
-        known = self.spins.tells_of(None if own is None else label_text(own))
-        return group_spin(self.spins, track, self.group) if known else None
+        own, spins = track.labels.get(self.spins.by), self.spins
+        if own is not None and level_of(label_text(own), spins.groups) is None:
+            spins = spins.with_unseen(self.spin_prior)
+        return group_spin(spins, track, self.group)
 
 
 _TYPES: dict[str, type] = {

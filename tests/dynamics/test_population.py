@@ -33,12 +33,18 @@ def test_a_number_names_the_group_of_earlier_files_and_unknown_ones_are_counted(
     assert note.startswith("2 of 3 tracks are of groups (session) that the model does not know, such as '3': ")
 
 
-def test_one_group_alone_does_not_show_how_others_differ_from_it() -> None:
-    alone = SpinPopulation("group", {"top": TOP})
-    assert [alone.tells_of(group) for group in ("top", None, "side")] == [True, True, False]
-    assert SPINS.tells_of("side")
-    (note,) = alone.unknown([{"group": "side"}])
-    assert note.endswith("they get the usual prior of spins, not its only group's, top")
+def test_an_unseen_group_counts_as_one_of_those_seen() -> None:
+    """Laplace's rule: of k groups of equal weight and one that nobody has seen, the next one is new once in k + 1."""
+    generator, count = np.random.default_rng(5), 600_000
+    draws = np.concatenate(
+        [generator.normal(TOP.mean, TOP.sigma, (count, 3)), generator.normal(0.0, 60.0, (count, 3))],
+    )
+    mean, covariance = SpinPopulation("group", {"top": TOP}).with_unseen(60.0).spin("side")
+    np.testing.assert_allclose(mean, draws.mean(axis=0), atol=0.5)
+    np.testing.assert_allclose(covariance, np.cov(draws.T), rtol=0.01, atol=10.0)
+    np.testing.assert_array_equal(SPINS.with_unseen(60.0).spin("top")[0], TOP.mean)
+    (note,) = SPINS.unknown([{"group": "side"}])
+    assert note.endswith("they get the mixture of its groups, back, top, and of the usual prior")
 
 
 @pytest.mark.parametrize("unknown", [None, "side"])
