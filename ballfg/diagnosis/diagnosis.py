@@ -18,7 +18,7 @@ from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.sparse import fallback
-from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
+from ballfg.diagnosis.residual_tests.tracker_errors import in_the_fit, look_at_tracker, with_errors_of_counting
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
 from ballfg.diagnosis.search.plausible import at_bound, implausible
@@ -70,7 +70,7 @@ def diagnose(
     check_range("name_at", name_at, 0.0, 1.0)
     model = analytic(model)
     tell = watch or (lambda line: None)
-    holdout = hold_out(dataset, model, jobs, tell)
+    holdout = with_errors_of_counting(hold_out(dataset, model, jobs, tell))
     evaluate = partial(errors_of, holdout=holdout, tracks=holdout.held_out_tracks, jobs=jobs)
     effects = tuple(catalogue or EFFECTS.values())
     loop = SearchLoop(
@@ -80,13 +80,14 @@ def diagnose(
     corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
     tell("looking at what is left")
     labels, of_labels = _labels(search, model, holdout, tracker, jobs)
-    tests = in_order(*generic_tests(search.fit, search.first, tracker), *of_labels)
+    of_fit = in_the_fit(tracker, dataset) if holdout.stamps.counted else tracker
+    tests = in_order(*generic_tests(search.fit, search.first, of_fit), *of_labels)
     verdict = verdict_of(search, tests)
     helped = None
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
-        helped = fallback(search.fit, embedding, corrected, dataset, parts, search.judged, evaluate, jobs)
+        helped = fallback(search.fit, embedding, corrected, holdout.dataset, parts, search.judged, evaluate, jobs)
     unexplained = what_is_left(tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, analytic, hold_out
-from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
+from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker, with_errors_of_counting
 from ballfg.diagnosis.search.evaluation import LEAST_PREDICTED, OBSERVED
 from ballfg.diagnosis.search.process_noise import errors_of, noise_about, predictive_model
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit
@@ -38,12 +38,12 @@ def error_budget(
             without a hit from samples of which most are no outliers.
     """
     model, tell = analytic(model), watch or (lambda line: None)
-    holdout = hold_out(dataset, model, jobs, tell)
+    holdout = with_errors_of_counting(hold_out(dataset, model, jobs, tell))
     tell("fitting the model and its noise")
     fitted = predictive_model(holdout, jobs, first_fit(model, holdout))
     tracker = look_at_tracker(fitted, holdout, jobs)
     if tracker.findings:
-        fitted.noise = noise_about(fitted, holdout.search_tracks, dataset, tracker.noise, jobs=jobs)
+        fitted.noise = noise_about(fitted, holdout.search_tracks, holdout.dataset, tracker.noise, jobs=jobs)
     tell("predicting the other half")
     before, after = (
         errors_of(m, holdout, holdout.held_out_tracks, jobs) for m in (as_declared(fitted, holdout.stamps), fitted)

@@ -203,17 +203,19 @@ def linearised(
     *,
     jobs: int = 1,
 ) -> LinearTracks | None:
-    """Tracks linearised about estimates with white noise alone; None if all are short.
+    """Tracks linearised about estimates without memory of the tracker; None if all are short.
+
+    Jitter stays in: to white noise alone, stamps that err by more look like hits.
 
     Args:
         model: the ball, and how it is measured.
         surfaces: what it may bounce on.
-        settings: their memory and jitter are ignored.
+        settings: their memory is ignored.
         tracks: measured.
         watch: called for each track.
         jobs: processes.
     """
-    plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
+    plain = replace(settings, memory=(0.0, 0.0, 0.0))
     tracks = [track.since_first() for track in tracks]
     if model.measures_plainly:
         return linearise(Smoother(model, surfaces, plain), tracks, watch, jobs=jobs)
