@@ -11,11 +11,12 @@ from ballfg.diagnosis.error_budget import budget_of
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, analytic, hold_out
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.generic_test import ALARM, APART, GenericTest
+from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import sentence
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
+from ballfg.diagnosis.residual_tests.predicted import predicted_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.sparse import fallback
 from ballfg.diagnosis.residual_tests.tracker_errors import in_the_fit, look_at_tracker, with_errors_of_counting
@@ -81,7 +82,8 @@ def diagnose(
     tell("looking at what is left")
     labels, of_labels = _labels(search, model, holdout, tracker, jobs)
     of_fit = in_the_fit(tracker, dataset) if holdout.stamps.counted else tracker
-    tests = in_order(*generic_tests(search.fit, search.first, of_fit), *of_labels)
+    of_noise = predicted_test(search.before, search.judged, len(np.unique(holdout.search.track)))
+    tests = in_order(*generic_tests(search.fit, search.first, of_fit), of_noise, *of_labels)
     verdict = verdict_of(search, tests)
     helped = None
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
@@ -206,7 +208,8 @@ def share_left(tests: Sequence[GenericTest]) -> float:
 
 def what_is_left(tests: tuple[GenericTest, ...], helped: Fallback | None = None) -> Unexplained:
     """The remaining pattern, in words, with all tests; helped: its description without a name."""
-    left = sorted(alarms(tests), key=lambda test: test.name in ("time", APART))  # a place says more than a correlation
+    vague = ("time", APART, PREDICTED)  # a place says more
+    left = sorted(alarms(tests), key=lambda test: test.name in vague)
     return Unexplained(left[0].where if left else "", share_left(tests), tests, helped)
 
 

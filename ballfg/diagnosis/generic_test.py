@@ -9,6 +9,9 @@ ALARM: Final = 0.005
 APART: Final = "tracks"
 """Name of the test for whiteness where nothing is left once each track has its own coefficients."""
 
+PREDICTED: Final = "predictions"
+"""Name of the test of a model's noise on tracks that it was not fitted to."""
+
 
 @dataclass(frozen=True)
 class GenericTest:
@@ -16,8 +19,8 @@ class GenericTest:
 
     Attributes:
         name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
-            against flights), `time` (whiteness along the tracks) or `tracks` (the same, where each track's own
-            coefficients explain it).
+            against flights), `time` (whiteness along the tracks) `tracks` (the same, where each track's own
+            coefficients explain it) or `predictions` (errors on the held-out half against the noise).
         where: place, dependence and size of the pattern in words.
         p_value: probability of such a pattern by chance; for `label`, that every label is right.
         share: remaining part of the initial pattern, 0 to 1.

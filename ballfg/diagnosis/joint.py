@@ -28,6 +28,7 @@ from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import joined as listed, sentence
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
+from ballfg.diagnosis.residual_tests.predicted import predicted_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.loop import NAMED, SearchLoop
@@ -107,7 +108,8 @@ def diagnose_jointly(
     labels = _labels(rooms, models, model, jobs)
     of_labels = () if labels is None else (label_test(labels),)
     patterns = (test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
-    tests = in_order(*patterns, *of_labels)
+    searched = len(np.unique(halves.search.track))
+    tests = in_order(*patterns, predicted_test(search.before, search.judged, searched), *of_labels)
     verdict = verdict_of(search, tests)
     unexplained = what_is_left(tests)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
@@ -121,7 +123,7 @@ def diagnose_jointly(
         rounds=search.rounds,
         before=search.before,
         after=search.judged,
-        tracks_found_on=len(np.unique(halves.search.track)),
+        tracks_found_on=searched,
         tracks_judged_on=len(search.before.by_track),
         calibrated=calibrated,
         noise={},

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.diagnosis.fit.patterns import EVERYWHERE
-from ballfg.diagnosis.generic_test import ALARM, APART
+from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED
 from ballfg.diagnosis.report import wording
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.residual_tests.label_check import LABEL
@@ -26,6 +26,7 @@ PLACES: Final = {
     APART: "from track to track",
     "label": "in the spin labels",
     "time": "from sample to sample",
+    PREDICTED: "in predictions",
 }
 """Beginning of a test's words, and the same within a sentence."""
 SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
@@ -196,6 +197,8 @@ def _to_look_at(pattern: str) -> str:
         return "look for what delays or smooths the positions between the camera and the file"
     if pattern.startswith(f"{APART}: "):
         return "note for each shot which ball flew and what else was changed, as labels; or fly one ball at one setting"
+    if pattern.startswith(f"{PREDICTED}: "):
+        return "compare the worst tracks with the others, and see what changes with every second track"
     if EVERYWHERE in pattern:
         return "record tracks at other speeds, spins and places than these"
     return "record tracks in which it varies more"
