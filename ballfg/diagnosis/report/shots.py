@@ -1,4 +1,4 @@
-"""Draws predictions: one shot before and after, and a map of the errors on the table and in flight."""
+"""Draws predictions: one shot before and after, and the errors by place, by time and along the recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.report.pictures import AFTER, BEFORE, GREY
@@ -81,10 +82,10 @@ def shot_picture(shot: ShotErrors, changed: bool) -> Figure:
 
 
 def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
-    """Prediction errors by place, seen from above, and by time since the last observed sample."""
+    """Prediction errors by place, seen from above, by time since the last observed sample, and along the recording."""
     series = [("before", before, BEFORE), ("after", after, AFTER)] if changed else [("", after, AFTER)]
-    figure = Figure(figsize=(SHEET, 2.6 + 2.6 * len(series)), layout="constrained")
-    panels: Sequence[Axes] = figure.subplots(len(series) + 1, 1)
+    figure = Figure(figsize=(SHEET, 4.6 + 2.6 * len(series)), layout="constrained")
+    panels: Sequence[Axes] = figure.subplots(len(series) + 2, 1)
     places = np.concatenate([path.measured for path in after.paths])
     ends = np.quantile(places[:, :2], (0.01, 0.99), axis=0).T
     counts = (DEEP, ACROSS) if np.ptp(ends[1]) > np.ptp(ends[0]) else (ACROSS, DEEP)
@@ -100,14 +101,19 @@ def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
             axes.text(middles[0][i], middles[1][j], f"{cell[i, j]:.0f}", ha="center", va="center", size=9, color=ink)
         axes.set(xlabel="x, m", ylabel="y, m")
         axes.set_title(f"error by place, from above, mm{f': {name}' if name else ''}", size=11)
-    last = panels[-1]
+    ahead, along = panels[-2:]
     for name, errors, colour in series:
-        last.plot(*_in_time(errors.paths), "o-", color=colour, label=name)
-    last.set(xlabel="time since the last observed sample, s", ylabel="error, mm", ylim=(0.0, None))
-    last.set_title("prediction error by time", size=11)
-    last.grid(visible=True, alpha=0.25)
+        ahead.plot(*_in_time(errors.paths), "o-", color=colour, label=name)
+        along.plot(np.arange(1, 1 + len(errors.paths)), _by_track(errors.paths), ".", color=colour)
+    ahead.set(xlabel="time since the last observed sample, s", ylabel="error, mm", ylim=(0.0, None))
+    ahead.set_title("prediction error by time", size=11)
+    along.set(xlabel="held-out tracks in their order", ylabel="error, mm", ylim=(0.0, None))
+    along.set_title("prediction error along the recording", size=11)
+    along.xaxis.set_major_locator(MaxNLocator(integer=True))
+    for axes in (ahead, along):
+        axes.grid(visible=True, alpha=0.25)
     if changed:
-        last.legend(fontsize="small")
+        ahead.legend(fontsize="small")
     return figure
 
 
@@ -121,6 +127,11 @@ def _cells(paths: Sequence[PredictedPath], edges: Sequence[Array]) -> Array:
     cell = np.ravel_multi_index([place[inside] for place in places], shape)
     count, total = (np.bincount(cell, weights, np.prod(shape)).reshape(shape) for weights in (None, squares[inside]))
     return np.where(count >= LEAST_SAMPLES, 1e3 * np.sqrt(total / np.maximum(count, 1)), np.nan)
+
+
+def _by_track(paths: Sequence[PredictedPath]) -> Array:
+    """(t,) mm, root mean square error of each track."""
+    return np.array([1e3 * np.sqrt((distances(path) ** 2).mean()) for path in paths])
 
 
 def _in_time(paths: Sequence[PredictedPath]) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.binned import binned, in_flight, motion_axes, slip_speed, turned
-from ballfg.diagnosis.report.shots import ShotErrors, shot_picture
+from ballfg.diagnosis.report.shots import ShotErrors, error_map, shot_picture
 from ballfg.diagnosis.report.wording import change, fixed, joined, listed, number, plus_minus, probability
 from ballfg.diagnosis.result import Errors, PredictedPath, Value
 from tests.diagnosis.made_diagnosis import WIND, errors, found, residuals, rounds
@@ -145,6 +145,25 @@ def test_a_shot_is_seen_along_its_own_direction() -> None:
         off = 0.1 if axes is top else 0.0
         assert_allclose(predicted.get_xydata(), np.column_stack((along[3:], np.add(up[3:], off))), atol=1e-12)
     assert_allclose(error.lines[0].get_xydata(), [[0.1, 100.0], [0.2, 100.0], [0.3, 100.0]], atol=1e-9)
+
+
+def test_errors_are_shown_along_the_recording() -> None:
+    """A ball that wears: each track is predicted 2 mm worse than the one before it; the correction takes half away."""
+
+    def worse(rate_mm: float) -> Errors:
+        measured = np.zeros((6, 3))
+        off = [1e-3 * rate_mm * (k + 1) * np.array([0.6, 0.0, 0.8]) for k in range(5)]
+        paths = [
+            PredictedPath(f"{k}", measured[:2], 0.1 * np.arange(1, 7), measured + shift, measured)
+            for k, shift in enumerate(off)
+        ]
+        return Errors(9.0, 9.0, 1.0, 0.0, np.full(5, 9.0), paths=tuple(paths))
+
+    panel = error_map(worse(2.0), worse(1.0), True).axes[-1]
+    for line, rate in zip(panel.get_lines(), (2.0, 1.0), strict=True):
+        assert_allclose(line.get_xdata(), np.arange(1, 6))
+        assert_allclose(line.get_ydata(), rate * np.arange(1, 6))
+    assert "order" in panel.get_xlabel()
 
 
 def test_errors_by_track_leaves_out_what_could_not_be_judged() -> None:
