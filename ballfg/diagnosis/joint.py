@@ -36,7 +36,6 @@ from ballfg.diagnosis.search.process_noise import calibrated_model, errors_of, f
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.tracks import Dataset
-from ballfg.tracks.noise import TrackNoise
 
 ROOM: Final = "room"
 """The label that identifies the rooms."""
@@ -217,7 +216,6 @@ class _Predicting:
 
     def __init__(self, rooms: Sequence[Room], jobs: int) -> None:
         self.rooms, self.jobs = rooms, jobs
-        self._noise: dict[str, TrackNoise | None] = {}
         self._models: WeakKeyDictionary[BallModel, dict[str, AnalyticModel]] = WeakKeyDictionary()
         self._judged: WeakKeyDictionary[BallModel, dict[str, Errors]] = WeakKeyDictionary()
 
@@ -255,9 +253,7 @@ class _Predicting:
         own, holdout = replace(fit.problem, stretches=stretches, deviations={}), room.holdout
         unknowns = replace(fit.unknowns, values=values, launcher=fit.unknowns.launcher[room.settings])
         model = calibrated_model(Fit(own, unknowns, noise, fit.predicted), holdout.launcher.embedding)
-        if room.name not in self._noise:
-            self._noise[room.name] = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=self.jobs)
-        model.noise = self._noise[room.name]
+        model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=self.jobs)
         return model
 
     def _errors(self, models: dict[str, AnalyticModel]) -> dict[str, Errors]:

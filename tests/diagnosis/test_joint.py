@@ -75,6 +75,13 @@ def test_predictions_get_better_in_both_rooms(joint):
     assert len(joint.whole.before.by_track) == len(joint.whole.after.by_track)
 
 
+def test_the_noise_of_a_room_is_that_about_its_corrected_model(joint):
+    """No motion is random. What the declared model lacks would look like 0.1 m/s^2/sqrt(Hz) and make intervals wide."""
+    for model in joint.rooms.values():
+        assert model.noise.acceleration < 0.03
+    assert 0.6 < joint.whole.after.nis < 1.6
+
+
 @pytest.mark.usefixtures("blank_pictures")
 def test_the_folder_holds_the_ball_and_the_rooms(joint, tmp_path):
     write_report(joint.whole, tmp_path / "out", joint.rooms)
