@@ -247,6 +247,7 @@ class _Predicting:
     def _model(self, fit: Fit, room: Room) -> AnalyticModel:
         rows = np.array([name.startswith(f"{room.name}/") for name in fit.problem.stretches.names])
         stretches = fit.problem.stretches.take(rows)
+        stretches = replace(stretches, settings=stretches.settings[:, room.settings])
         found = fit.problem.by_stretch(fit.unknowns.values, stretches)
         values = {name: float(np.ravel(value)[0]) for name, value in found.items()}
         noise = replace(fit.noise, position=fit.noise.position * room.noise.position)

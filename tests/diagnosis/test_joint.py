@@ -82,6 +82,16 @@ def test_the_noise_of_a_room_is_that_about_its_corrected_model(joint):
     assert 0.6 < joint.whole.after.nis < 1.6
 
 
+def test_rooms_without_labels_have_each_their_own_spins(rooms, tmp_path):
+    for room in rooms:
+        write_dataset(tmp_path / room.info.name, room.info, (replace(track, labels={}) for track in room))
+    bare = [read_dataset(tmp_path / room.info.name) for room in rooms]
+    found = diagnose_jointly(bare, nominal_model(), catalogue=[EFFECTS["buoyancy"]])
+    groups = {name: model.spins.groups for name, model in found.rooms.items()}
+    assert {name: set(own) for name, own in groups.items()} == {"level": {"level"}, "leaning": {"leaning"}}
+    assert [own[name].tracks for name, own in groups.items()] == [TRACKS, TRACKS]
+
+
 @pytest.mark.usefixtures("blank_pictures")
 def test_the_folder_holds_the_ball_and_the_rooms(joint, tmp_path):
     write_report(joint.whole, tmp_path / "out", joint.rooms)
