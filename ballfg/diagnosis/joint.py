@@ -283,7 +283,7 @@ def _pooled(by_room: dict[str, Errors]) -> Errors:
         np.concatenate([one.by_track for one in every]),
         middle("intervals_held"),
         middle("nis_median"),
-        tuple(path for one in every for path in one.paths),
+        tuple(replace(path, name=f"{room}/{path.name}") for room, one in by_room.items() for path in one.paths),
         float(np.sqrt(np.square([one.nis_error for one in every]).sum()) / len(every)),
     )
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis import diagnose_jointly, write_report
+from ballfg.diagnosis.report.shots import median_shot
 from ballfg.dynamics import EFFECTS, load_model, nominal_model
 from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
@@ -73,6 +74,14 @@ def test_the_balls_model_has_nothing_of_a_room_and_each_room_has_its_own(joint):
 def test_predictions_get_better_in_both_rooms(joint):
     assert joint.whole.after.prediction_rmse_mm < 0.7 * joint.whole.before.prediction_rmse_mm
     assert len(joint.whole.before.by_track) == len(joint.whole.after.by_track)
+
+
+def test_a_shot_is_compared_with_itself_and_not_with_its_namesake_of_another_room(joint):
+    """Tracks of both rooms have the same names."""
+    shot = median_shot(joint.whole.before, joint.whole.after, True)
+    np.testing.assert_array_equal(shot.before.measured, shot.after.measured)
+    names = [path.name for path in joint.whole.after.paths]
+    assert len(set(names)) == len(names)
 
 
 def test_the_noise_of_a_room_is_that_about_its_corrected_model(joint):
