@@ -11,15 +11,22 @@ from ballfg.diagnosis.error_budget import budget_of
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, analytic, hold_out
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest
 from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import sentence
+from ballfg.diagnosis.residual_tests.counted_stamps import (
+    noise_of_all_frames,
+    of_all_frames,
+    with_all_frames,
+    with_errors_of_counting,
+)
 from ballfg.diagnosis.residual_tests.generic import generic_tests
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
 from ballfg.diagnosis.residual_tests.predicted import predicted_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.sparse import fallback
-from ballfg.diagnosis.residual_tests.tracker_errors import in_the_fit, look_at_tracker, with_errors_of_counting
+from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
 from ballfg.diagnosis.search.plausible import at_bound, implausible
@@ -80,8 +87,8 @@ def diagnose(
     search = loop.run(model)
     corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
     tell("looking at what is left")
-    labels, of_labels = _labels(search, model, holdout, tracker, jobs)
-    of_fit = in_the_fit(tracker, dataset) if holdout.stamps.counted else tracker
+    of_fit = noise_of_all_frames(tracker, holdout.stamps, dataset)
+    labels, of_labels = _labels(search, model, with_all_frames(holdout, dataset), holdout.stamps, of_fit, jobs)
     of_noise = predicted_test(search.before, search.judged, len(np.unique(holdout.search.track)))
     tests = in_order(*generic_tests(search.fit, search.first, of_fit), of_noise, *of_labels)
     verdict = verdict_of(search, tests)
@@ -135,12 +142,13 @@ def _unpopulated(search: Search, holdout: Holdout, evaluate: Callable[[BallModel
 
 
 def _labels(
-    search: Search, model: AnalyticModel, holdout: Holdout, tracker: TrackNoise | None, jobs: int
+    search: Search, model: AnalyticModel, holdout: Holdout, stamps: Stamps, tracker: TrackNoise | None, jobs: int
 ) -> tuple[LabelCheck | None, tuple[GenericTest, ...]]:
-    """The verdicts on the spin labels, and their test; None without labels."""
+    """The verdicts on the spin labels, and their test; None without labels. holdout: with all frames."""
 
     def checked(fit: Fit) -> LabelCheck | None:
-        return check_labels(calibrated_model(fit, holdout.launcher.embedding), model, holdout, tracker, jobs=jobs)
+        corrected = of_all_frames(calibrated_model(fit, holdout.launcher.embedding), stamps)
+        return check_labels(corrected, model, holdout, tracker, jobs=jobs)
 
     now = checked(search.whole)
     if now is None:

@@ -4,7 +4,6 @@ A memory would absorb any effect that bends flights slowly, so effects are searc
 tested for memory and jitter, on both halves of the tracks.
 """
 
-import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +14,6 @@ from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import dataset_settings
 from ballfg.estimation.noise.estimate import linearised, spread_over
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, NUMBERS, TrackerPart, tracker_noise
-from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
 MOST_TRACKS = 25
@@ -40,31 +38,6 @@ class TrackerErrors:
 
     findings: tuple[Finding, ...] = ()
     noise: TrackNoise | None = None
-
-
-def with_errors_of_counting(holdout: Holdout) -> Holdout:
-    """The same halves; a dataset whose stamps count kept frames states how far its stamps are off, as a jitter.
-
-    The fit has the stamps with all frames, but predictions have those of the file. A model takes these for a clock that
-    is slow on average: without their error in the noise, steps over lost frames look like hits.
-    """
-    counted, info = holdout.stamps.counted, holdout.dataset.info
-    off = [np.std(track.seconds - counted[track.name]) for track in holdout.dataset if track.name in counted]
-    if not off:
-        return holdout
-    stated = info.noise or TrackNoise()
-    jitter = float(np.hypot(np.median(off), stated.stamp_jitter or 0.0))  # some tracks' frames are counted wrongly
-    dataset = copy.copy(holdout.dataset)
-    dataset.info = replace(info, noise=replace(stated, stamp_jitter=jitter))
-    return replace(holdout, dataset=dataset)
-
-
-def in_the_fit(noise: TrackNoise | None, dataset: Dataset) -> TrackNoise | None:
-    """The found noise of the tracker about a fit, whose stamps count all frames: of jitter what the dataset states."""
-    if noise is None:
-        return None
-    own = replace(noise, stamp_jitter=None if dataset.info.noise is None else dataset.info.noise.stamp_jitter)
-    return own if own.memory is not None or own.stamp_jitter else None
 
 
 def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> TrackerErrors:
