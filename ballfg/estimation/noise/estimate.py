@@ -120,7 +120,8 @@ def estimate_noise(
     measured = check_each("tracks", tracks, Track, "Make one with Track(times, positions).")
     parts = [part for track in measured if len(part := track.opening(longest)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
-    linear = linearised(model, surfaces, settings, parts, watch, jobs=jobs)
+    about = settings if tracker_known else replace(settings, stamp_jitter=0.0)  # a guess of it moves no estimate
+    linear = linearised(model, surfaces, about, parts, watch, jobs=jobs)
     if linear is None:
         return None
     known = (position_known or own_sigmas, tracker_known)
@@ -174,7 +175,7 @@ def held_with(model: BallModel, surfaces: Surfaces, settings: Settings, tracks: 
         search = _search(parts, settings, known, linear)
         return search.held(search.start)
 
-    linear = linearised(model, surfaces, settings, parts)
+    linear = linearised(model, surfaces, replace(settings, stamp_jitter=0.0), parts)  # as `estimate_noise` has them
     return math.nan if linear is None else on_one_thread(held, linear)
 
 
@@ -205,7 +206,7 @@ def linearised(
 ) -> LinearTracks | None:
     """Tracks linearised about estimates without memory of the tracker; None if all are short.
 
-    Jitter stays in: to white noise alone, stamps that err by more look like hits.
+    Known jitter stays in: to white noise alone, stamps that err by more look like hits.
 
     Args:
         model: the ball, and how it is measured.
