@@ -24,7 +24,7 @@ from ballfg.estimation.sides.monitor import widening
 from ballfg.estimation.smoother.pieces.section import shifted
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import CERTAIN, Solved, log_evidence
-from ballfg.estimation.smoother.settle import Other, Solution
+from ballfg.estimation.smoother.settle import ROUGH, Other, Solution
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.state import Z
 from ballfg.tracks import Track
@@ -35,6 +35,8 @@ REACH: Final = 0.3
 """s, on each side of a gap: these samples show the motion at its ends, whatever was before and after them."""
 MOST: Final = 8
 """Largest number of contacts that the motion before a gap may foretell."""
+QUICK: Final = 20
+"""Largest number of linear solutions for an explanation: what needs more is improbable."""
 APART: Final = -math.log(CERTAIN)
 """nats, by which an explanation is so much less probable than another one that it is left out."""
 
@@ -99,7 +101,8 @@ class _Local:
     def __post_init__(self) -> None:
         self.apart = self.smoother.segment(self.track, USUAL.short_gap)
         calm = replace(self.smoother.settings, find_events=False)  # a wrong number would ask for hits
-        self.calm = Smoother(self.smoother.model, self.smoother.surfaces, calm, self.smoother.optimizer)
+        quick = replace(self.smoother.optimizer, max_iterations=QUICK, tolerance=ROUGH)
+        self.calm = Smoother(self.smoother.model, self.smoother.surfaces, calm, quick)
 
     def likely(self, *counts: int) -> Iterator[Segmentation]:
         """The events of the most probable explanation, then of those that are nearly as probable.
