@@ -64,6 +64,29 @@ def test_bounces_in_a_gap_are_counted(seed: int) -> None:
     assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[:, :6, :6]), off).max() < 40.0
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_stroke_in_a_gap_is_a_hit(seed: int) -> None:
+    """No number of bounces explains a ball that comes back."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, 1.2, 1.0 / 120.0)
+    struck = rng.uniform(0.55, 0.65)
+    after = times >= struck
+    z, v, _ = heights(times, 0.3, 0.5)
+    at, _, _ = heights(np.array([0.0, struck]), 0.3, 0.5)
+    rise = rng.uniform(1.0, 2.0)
+    z[after] = at[1] + rise * (times[after] - struck) - 0.5 * G * (times[after] - struck) ** 2
+    v[after] = rise - G * (times[after] - struck)
+    flying = z > 0.0
+    speed = np.where(after, -4.0, 4.0)
+    x = np.where(after, 4.0 * struck - 4.0 * (times - struck), 4.0 * times)
+    seen = flying & (np.abs(times - struck) > 0.15)
+    truth = np.column_stack((x, 0.3 * times, z + MODEL.radius, speed, np.full(len(x), 0.3), v))[seen]
+    found = SMOOTHER.estimate(Track(times[seen], truth[:, :3] + NOISE * rng.normal(size=(seen.sum(), 3))))
+    assert found.hits.tolist() == [int(np.diff(times[seen]).argmax())]
+    off = found.states[:, :6] - truth
+    assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[:, :6, :6]), off).max() < 40.0
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_a_stream_does_not_guess_the_bounces_in_a_gap(seed: int) -> None:
     """States after a long gap are those of the samples after it, until these are enough; the whole track links them."""

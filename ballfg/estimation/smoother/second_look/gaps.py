@@ -33,6 +33,8 @@ MANY_STEPS: Final = 3.0
 """Least length of a gap over the usual step. Where all steps are so long, samples show too little between them."""
 REACH: Final = 0.3
 """s, on each side of a gap: these samples show the motion at its ends, whatever was before and after them."""
+HIT: Final = -1
+"""In place of a number of contacts: a hit in the gap."""
 MOST: Final = 8
 """Largest number of contacts that the motion before a gap may foretell."""
 QUICK: Final = 20
@@ -107,8 +109,9 @@ class _Local:
     def likely(self, *counts: int) -> Iterator[Segmentation]:
         """The events of the most probable explanation, then of those that are nearly as probable.
 
-        Numbers of contacts grow and fall from given ones as long as that is more probable.
+        Numbers of contacts grow and fall from given ones as long as that is more probable. A hit explains any number.
         """
+        self._evidence(HIT)
         for count in counts:
             for change in (1, -1):
                 best = count
@@ -119,18 +122,17 @@ class _Local:
 
     def _evidence(self, count: int) -> float:
         if count not in self.explained:
-            problem = self.calm.problem(
-                self.track, _with_contacts(self.apart, self.track, self.smoother.surfaces, self.gap, count)
-            )
+            events = _with_contacts(self.apart, self.track, self.smoother.surfaces, self.gap, count)
+            problem = self.calm.problem(self.track, events)
             solution = self.calm.settle(problem)
-            events = replace(solution.events.segmentation, contacts=solution.events.contacts)
-            self.explained[count] = _evidence(problem, solution), events
+            found = replace(solution.events.segmentation, contacts=solution.events.contacts)
+            self.explained[count] = _evidence(problem, solution), found
         return self.explained[count][0]
 
 
 def _with_contacts(apart: Segmentation, track: Track, surfaces: Surfaces, gap: int, count: int) -> Segmentation:
-    """Events whose gap is linked, with contacts evenly over it: they move to where they belong."""
-    parts = (np.arange(count) + 0.5) / max(count, 1)
+    """Events whose gap is linked, with contacts evenly over it: they move to where they belong. count: or `HIT`."""
+    parts = (np.arange(max(count, 0)) + 0.5) / max(count, 1)
     times = track.times[gap] + parts * (track.times[gap + 1] - track.times[gap])
     below = zip(times.tolist(), _heights_below(surfaces, track, gap, parts), strict=True)
     contacts = [Contact(gap, time, height) for time, height in below if height > -math.inf]
@@ -138,7 +140,7 @@ def _with_contacts(apart: Segmentation, track: Track, surfaces: Surfaces, gap: i
     return replace(
         apart,
         contacts=tuple(sorted(contacts, key=lambda contact: contact.time)),
-        hits=np.setdiff1d(apart.hits, [gap]),
+        hits=np.union1d(apart.hits, [gap]) if count == HIT else np.setdiff1d(apart.hits, [gap]),
         restarts=np.setdiff1d(apart.restarts, [gap]),
     )
 
