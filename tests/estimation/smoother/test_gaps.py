@@ -14,7 +14,7 @@ from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.second_look.at_end import log_evidence
-from ballfg.estimation.smoother.second_look.gaps import with_other_contacts
+from ballfg.estimation.smoother.second_look.gaps import UNSURE, with_other_contacts
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import COEFFICIENTS
 from ballfg.tracks import Track
@@ -130,6 +130,7 @@ def test_what_is_nearly_as_probable_is_in_the_covariance() -> None:
     jump = (moved.states - one.states)[:, :, None]
     mixture = one.covariances + 0.2 * jump * jump.swapaxes(1, 2)
     assert np.linalg.eigvalsh(held.covariances - mixture).min() > -1e-9 * np.abs(mixture).max()
+    assert with_other_contacts(held, moved, 2.0).notes == (*one.notes, UNSURE)
     assert with_other_contacts(one, moved, 12.0) is one
 
 

@@ -39,6 +39,9 @@ MOST: Final = 8
 """Largest number of contacts that the motion before a gap may foretell."""
 QUICK: Final = 20
 """Largest number of linear solutions for an explanation: what needs more is improbable."""
+UNSURE: Final = (
+    "how the ball bounced where samples are missing is not certain: covariances hold what is nearly as probable"
+)
 APART: Final = -math.log(CERTAIN)
 """nats, by which an explanation is so much less probable than another one that it is left out."""
 
@@ -221,7 +224,7 @@ def _evidence(problem: TrackProblem, solution: Solution) -> float:
 
 
 def with_other_contacts(estimate: Estimate, other: Estimate, odds: float) -> Estimate:
-    """The estimate with covariances that hold another one's states too; odds: log, of its own."""
+    """The estimate with covariances that hold another one's states too, and a note; odds: log, of its own."""
     chance = 1.0 / (1.0 + math.exp(max(odds, 0.0)))
     if not chance > CERTAIN:
         return estimate
@@ -229,4 +232,5 @@ def with_other_contacts(estimate: Estimate, other: Estimate, odds: float) -> Est
     for k, near in enumerate(estimate.covariances):
         far, jump = other.covariances[k], other.states[k] - estimate.states[k]
         covariances[k] += widening(near, far, jump, chance)
-    return replace(estimate, covariances=covariances)
+    notes = estimate.notes if UNSURE in estimate.notes else (*estimate.notes, UNSURE)
+    return replace(estimate, covariances=covariances, notes=notes)
