@@ -120,12 +120,14 @@ def assign(costs: Array, limit: float) -> list[tuple[int, int]]:
     if costs.size == 0:
         return []
     allowed = np.where(costs <= limit, costs, FAR)
-    if 1 in costs.shape:  # one ball or one position: scipy takes half a second to import
+    if 1 in costs.shape:  # one ball or one position
         nearest = np.unravel_index(int(allowed.argmin()), costs.shape)
         pairs = [(int(nearest[0]), int(nearest[1]))]
     else:
-        from scipy.optimize import linear_sum_assignment
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
-        rows, columns = linear_sum_assignment(allowed)
+        # quicker to import than scipy.optimize; one more for each pair, since a sparse matrix has no pairs that cost 0
+        rows, columns = min_weight_full_bipartite_matching(csr_array(allowed + 1.0))
         pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
     return [(i, j) for i, j in pairs if costs[i, j] <= limit]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
@@ -75,12 +76,10 @@ class GaussianMixture:
 
     def truncated(self, gaps: Array, gradients: Array) -> "GaussianMixture":
         """The part above a surface, from gaps (n,) m and gradients (n, d); weighted by the remaining shares."""
-        from scipy import special  # few tracks end near a contact, and it takes a tenth of a second to import
-
         along = (self.covariances @ gradients[..., None])[..., 0]
         sigma = np.sqrt(np.maximum((gradients * along).sum(axis=1), LEAST_SPREAD**2))
         along, cut = along / sigma[:, None], -gaps / sigma
-        log_share = special.log_ndtr(-cut)
+        log_share = torch.special.log_ndtr(torch.from_numpy(-cut)).numpy()  # scipy's is slow to import
         shift = np.exp(-0.5 * cut**2 - 0.5 * np.log(2.0 * np.pi) - log_share)  # mean of a standard normal above the cut
         narrowing = shift * (cut - shift)
         means = self.means + shift[:, None] * along

@@ -29,8 +29,8 @@ whose surface is known to 4 mm shows on which side it is. 2 mm at 1000 Hz chose 
 judged it."""
 MOST_REJECTED: Final = 2
 """Number of consecutive samples without a fitting hypothesis after which another event is assumed."""
-GATE_CHANCE: Final = 1e-6
-"""Share of good positions that are rejected."""
+GATE: Final = 30.664849
+"""Squared whitened distance in three dimensions beyond which a position is rejected: one in a million good ones is."""
 FAR: Final = 4.0
 """Standard deviations of a contact's time beyond which a stamp lies on one side of it."""
 LEAST_SPEED: Final = 1e-3
@@ -234,13 +234,11 @@ class ContactMonitor:
         self._samples, self._elapsed, self._rejected = 0, 0.0, 0
 
     def _step(self, dt: float, measured: SampleMeasurement, bounced: Callable[[int], bool]) -> ContactState | None:
-        from scipy import special  # it takes a tenth of a second to import
-
         assert self._hypotheses is not None
         before = self._hypotheses
         new = before.sides[0].log_weight > np.log(NEGLIGIBLE)  # the bounce may lie in this interval
         after = before.step(dt, measured)
-        self._rejected = self._rejected + 1 if after.nearest > special.chdtri(3, GATE_CHANCE) else 0
+        self._rejected = self._rejected + 1 if after.nearest > GATE else 0
         if self._rejected:
             after = before.step(dt, SampleMeasurement())
         self._samples, self._elapsed = self._samples + 1, self._elapsed + dt

@@ -92,12 +92,12 @@ def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
             pixels[:, camera], covariances[:, camera] = footage.path(camera, mine).at(times)
     noisy = covariances + footage.offset**2 * np.eye(2)
     made = triangulate(footage.cameras, pixels, noisy)
-    found = np.isfinite(made.points).all(axis=1)
+    found: NDArray[np.bool_] = np.asarray(np.isfinite(made.points).all(axis=1))
     used = made.used[found]
     noise = np.trace(covariances[found], axis1=2, axis2=3) / 2.0
     share = np.mean(noise / (noise + footage.offset**2), axis=1, where=used)
     track = path(times[found], made.points[found], made.covariances[found] * share[:, None, None])
-    spread = made.covariances[found] + _of_cameras(footage.cameras, made.rows(found), noisy[found])
+    spread: Array = made.covariances[found] + _of_cameras(footage.cameras, made.rows(found), noisy[found])
     return Gathered(tuple(rows), track, spread, used.sum(axis=1).astype(np.int64))
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.estimation.segmentation.result import Contact
-from ballfg.estimation.sides.monitor import ENOUGH, MORE, SPREAD, Shared, widening, widening_near_contacts
+from ballfg.estimation.sides.monitor import ENOUGH, GATE, MORE, SPREAD, Shared, widening, widening_near_contacts
 
 G, E = 9.81, 0.9
 MODEL = AnalyticModel([EFFECTS["gravity"](g=G), EFFECTS["restitution"](e=E), EFFECTS["table_height"](offset=0.0)])
@@ -35,6 +35,10 @@ def beside(height_sigma: float) -> tuple[np.ndarray, np.ndarray]:
     model = AugmentedModel(MODEL, [name])
     contacts = (Contact(0, EARLY, 0.0),)
     return made, widening_near_contacts(np.array([0.0, 0.01]), made, covariances, contacts, model, shared)
+
+
+def test_the_gate_rejects_one_good_position_in_a_million() -> None:
+    assert chi2.sf(GATE, 3) == pytest.approx(1e-6, rel=1e-6)
 
 
 @pytest.mark.parametrize("height_sigma", [1e-9, 4e-4])
