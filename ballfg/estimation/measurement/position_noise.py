@@ -6,14 +6,18 @@ from functools import partial
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ballfg.arrays import Array, median
+from ballfg.arrays import Array, Mask, median
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.tracks import Track
+from ballfg.tracks.stamps import STAMP_TOLERANCE
 
-HALF_WINDOW = 5  # Number of samples on each side of the tested one
+HALF_WINDOW = 5  # Largest number of samples on each side of the tested one
+LEAST_HALF_WINDOW = 3  # Fewer would leave a bounce in the window, or an outlier, nearly without residuals
 DEGREE = 3  # Of the polynomials. Over `LONGEST_WINDOW` a flight differs from a cubic by less than 0.1 mm
-LONGEST_WINDOW = 0.3  # s. Windows with a gap, or of a slow tracker, are left out
+LONGEST_WINDOW = 0.25  # s. Windows of slow trackers have fewer samples; windows with a gap are left out
 REJECT = 5.0  # Windows with a residual above this many sigma hold a bounce, a hit or an outlier, and are left out
+LEAST_CLEAN = 0.1
+"""Share of windows without a residual beyond the stated noise that may be those without a bounce."""
 ROUNDS = 4  # Repetitions of estimate and rejection; the first one rejects nothing
 ENOUGH = 20_000  # Number of windows that gives sigma to 1 %; no further track is read
 FLOOR = 2e-4  # m. Least noise of a tracker of flying balls; identical or computed positions would give zero
@@ -32,7 +36,8 @@ MAD_TO_SIGMA = 1.4826  # Standard deviation of a normal variable divided by the 
 def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     """The standard deviation of each coordinate, for data that does not state it.
 
-    A cubic is fitted to each window of 11 samples without the middle one, and predicts that one. The residuals, divided
+    A cubic is fitted to each window of 11 samples, or 9 or 7 where a track is too slow or too short for more, without
+    the middle one, and predicts that one. The residuals, divided
     by the growth of the noise in such a prediction, have the standard deviation sought; their median absolute value
     gives it regardless of a few bad ones. Windows with a bounce, a hit or an outlier are rejected.
 
@@ -40,7 +45,7 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     the flight.
 
     Args: tracks: read until there are enough windows.
-    Returns: (3,) m, at least `FLOOR`; `FALLBACK` if every track is shorter than a window.
+    Returns: (3,) m, at least `FLOOR`; `FALLBACK` if no track has 7 samples within 0.25 s.
     """
     blocks, count = list[Array](), 0
     for track in tracks:
@@ -61,7 +66,7 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
     """
     first = slice(0, LOOKED_AT)
     times, positions = track.seconds[first], track.positions[first]
-    if track.rough or len(times) < LEAST_WINDOWS + 2 * HALF_WINDOW:
+    if track.rough or len(times) < LEAST_WINDOWS + 2 * LEAST_HALF_WINDOW:
         return ()
     white = sample_sigmas(settings, len(times), None if track.sigmas is None else track.sigmas[first])
     stated = total_sigmas(settings, white, partial(np.gradient, positions, times, axis=0))
@@ -69,7 +74,8 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
     if len(residuals) < LEAST_WINDOWS:
         return ()
     usual = median(stated)
-    seen, said = (float(np.sqrt(np.square(s).mean())) for s in (_robust_sigma(residuals * usual), usual))
+    shown = _robust_sigma(residuals * usual, usual)
+    seen, said = (float(np.sqrt(np.square(s).mean())) for s in (shown, usual))
     if seen <= MOST_SCATTER * said:
         return ()
     remedy = "State position_noise (ballfg noise finds it)." if track.sigmas is None else "State larger ones."
@@ -80,36 +86,58 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
 
 
 def _window_residuals(times: Array, positions: Array, sigmas: Array) -> Array:
-    """(w, 11, 3) residuals of the cubic through each window, in the standard deviations sigmas (n, 3) of one sample.
+    """(w, 2, 3) the middle residual of the cubic through each window, and the size of its largest one.
+
+    They are in the standard deviations sigmas (n, 3) of one sample.
 
     With the projection P = 1 - B B^T a residual r_i has the variance sum_j P_ij^2 sigma_j^2; for equal sigmas that is
     sigma^2 (1 - h) with h the leverage. Predicted without its own sample it is larger by 1 / (1 - h), so that
     r / sqrt(1 - h) standardises either of them.
     """
-    size = 2 * HALF_WINDOW + 1
-    if len(times) < size:
-        return np.empty((0, size, 3))
+    half = _half_window(times)
+    size = 2 * half + 1
+    if half < LEAST_HALF_WINDOW:
+        return np.empty((0, 2, 3))
     stamps = sliding_window_view(times, size)
     short = stamps[:, -1] - stamps[:, 0] <= LONGEST_WINDOW
     stamps = stamps[short]
-    centre = stamps[:, HALF_WINDOW, None]
+    centre = stamps[:, half, None]
     scaled = (stamps - centre) / (stamps[:, -1:] - stamps[:, :1])
     basis, _ = np.linalg.qr(scaled[..., None] ** np.arange(DEGREE + 1))
     left = np.eye(size) - basis @ basis.transpose(0, 2, 1)
     values, variances = (
         sliding_window_view(each, size, axis=0)[short].transpose(0, 2, 1) for each in (positions, sigmas**2)
     )
-    return np.asarray(left @ values / np.sqrt(np.maximum(left**2 @ variances, LEAST_LEFT * median(sigmas**2))))
+    residuals = left @ values / np.sqrt(np.maximum(left**2 @ variances, LEAST_LEFT * median(sigmas**2)))
+    return np.stack((residuals[:, half], np.abs(residuals).max(axis=1)), axis=1)
 
 
-def _robust_sigma(residuals: Array) -> Array:
-    """(3,) m from window residuals (w, 11, 3): MAD of the middle ones, over windows without large residuals."""
-    middle = residuals[:, HALF_WINDOW]
-    largest = np.abs(residuals).max(axis=1)
+def _half_window(times: Array) -> int:
+    """Number of samples on each side of the tested one, of windows that the track has and that last 0.25 s at most."""
+    if len(times) < 2 * LEAST_HALF_WINDOW + 1:
+        return 0
+    step = float(np.median(np.diff(times)))
+    return min(HALF_WINDOW, (len(times) - 1) // 2, int(LONGEST_WINDOW / (2.0 * max(step, STAMP_TOLERANCE))))
+
+
+def _robust_sigma(residuals: Array, stated: Array | None = None) -> Array:
+    """(3,) m from window residuals (w, 2, 3): MAD of the middle ones, over windows without large residuals.
+
+    Args: stated: (3,) m. What is large is judged by it first, if some windows have nothing so large: bounces that are
+        in most windows do not count as noise then.
+    """
+    middle, largest = residuals[:, 0], residuals[:, 1]
     sigma = MAD_TO_SIGMA * median(np.abs(middle))
+    if stated is not None and _clean(largest, stated).mean() > LEAST_CLEAN:
+        sigma = stated
     for _ in range(ROUNDS - 1):
-        clean = (largest <= REJECT * np.maximum(sigma, FLOOR)).all(axis=1)
+        clean = _clean(largest, sigma)
         if not clean.any():
             break
         sigma = MAD_TO_SIGMA * median(np.abs(middle[clean]))
     return np.asarray(sigma)
+
+
+def _clean(largest: Array, sigma: Array) -> Mask:
+    """(w,) bool, windows whose largest residuals (w, 3) are not beyond some noise (3,)."""
+    return np.asarray((largest <= REJECT * np.maximum(sigma, FLOOR)).all(axis=1))

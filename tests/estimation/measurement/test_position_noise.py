@@ -65,6 +65,32 @@ def test_scatter_of_other_sources_is_no_noise_of_positions():
     assert not noise_doubts(replace(track, observations=(speeds,), rough=True), Settings(**little))
 
 
+@pytest.mark.parametrize("rate", [25.0, 30.0, 35.0])
+@pytest.mark.parametrize("size", [0.3, 1.0, 4.0])
+def test_slow_trackers_show_their_noise(rate, size):
+    """Eleven samples last longer than a flight is a cubic; fewer do not."""
+    rng = np.random.default_rng(7)
+    tracks = [bouncing(rng, n=24, rate=rate, sigma=size * SIGMA) for _ in range(40)]
+    assert estimate_position_noise(tracks) == pytest.approx(size * SIGMA, rel=0.35)
+
+
+@pytest.mark.parametrize("n", [7, 10])
+def test_short_tracks_show_their_noise(n):
+    rng = np.random.default_rng(8)
+    tracks = [bouncing(rng, n=n, sigma=5.0 * SIGMA) for _ in range(200)]
+    assert estimate_position_noise(tracks) == pytest.approx(5.0 * SIGMA, rel=0.2)
+
+
+@pytest.mark.parametrize("rate", [30.0, 35.0, 40.0])
+def test_bounces_in_most_windows_are_no_noise(rate):
+    """With a bounce every 0.4 s most windows of a slow tracker hold one; the others show what is stated."""
+    rng = np.random.default_rng(9)
+    tracks = [bouncing(rng, n=int(1.6 * rate), rate=rate) for _ in range(50)]
+    right, third = (Settings(position_noise=tuple(share * SIGMA)) for share in (1.0, 1 / 3))
+    assert sum(bool(noise_doubts(track, right)) for track in tracks) <= 1
+    assert sum(bool(noise_doubts(track, third)) for track in tracks) >= 48
+
+
 def test_every_estimator_notes_the_scatter():
     track = bouncing(np.random.default_rng(5))
     for method in ("smoother", "online", "ekf", "sliding-window"):
