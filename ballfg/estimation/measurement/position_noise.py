@@ -9,7 +9,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ballfg.arrays import Array, Mask, median
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.tracks import Track
-from ballfg.tracks.stamps import STAMP_TOLERANCE
 
 HALF_WINDOW = 5  # Largest number of samples on each side of the tested one
 LEAST_HALF_WINDOW = 3  # Fewer would leave a bounce in the window, or an outlier, nearly without residuals
@@ -22,6 +21,7 @@ ROUNDS = 4  # Repetitions of estimate and rejection; the first one rejects nothi
 ENOUGH = 20_000  # Number of windows that gives sigma to 1 %; no further track is read
 FLOOR = 2e-4  # m. Least noise of a tracker of flying balls; identical or computed positions would give zero
 FALLBACK = 2e-3  # m. Noise of a camera tracker in a room, for data in which no track has a window
+MOST_WINDOWS = 0.75  # Share of windows that dropped frames may not make too long; else windows have fewer samples
 LEAST_LEFT = 1e-6
 """Least share of a sample's variance that a fit leaves: a sample far from all others determines the cubic alone."""
 LOOKED_AT = 128
@@ -113,11 +113,16 @@ def _window_residuals(times: Array, positions: Array, sigmas: Array) -> Array:
 
 
 def _half_window(times: Array) -> int:
-    """Number of samples on each side of the tested one, of windows that the track has and that last 0.25 s at most."""
+    """Number of samples on each side of the tested one: as many as leave most windows no longer than 0.25 s.
+
+    It is `LEAST_HALF_WINDOW` if even these are longer, and 0 for a track without a window.
+    """
     if len(times) < 2 * LEAST_HALF_WINDOW + 1:
         return 0
-    step = float(np.median(np.diff(times)))
-    return min(HALF_WINDOW, (len(times) - 1) // 2, int(LONGEST_WINDOW / (2.0 * max(step, STAMP_TOLERANCE))))
+    for half in range(min(HALF_WINDOW, (len(times) - 1) // 2), LEAST_HALF_WINDOW, -1):
+        if (times[2 * half :] - times[: -2 * half] <= LONGEST_WINDOW).mean() > MOST_WINDOWS:
+            return half
+    return LEAST_HALF_WINDOW
 
 
 def _robust_sigma(residuals: Array, stated: Array | None = None) -> Array:

@@ -91,6 +91,17 @@ def test_bounces_in_most_windows_are_no_noise(rate):
     assert sum(bool(noise_doubts(track, third)) for track in tracks) >= 48
 
 
+def test_dropped_frames_leave_enough_windows():
+    """A fifth of the frames is lost at 50 Hz: eleven samples often last too long, and fewer are taken."""
+    rng, noted = np.random.default_rng(10), 0
+    for _ in range(50):
+        track = bouncing(rng, n=50, rate=50.0)
+        kept = rng.random(len(track)) > 0.2
+        track = Track(track.times[kept], track.positions[kept])
+        noted += bool(noise_doubts(track, Settings(position_noise=tuple(SIGMA / 3))))
+    assert noted >= 48
+
+
 def test_every_estimator_notes_the_scatter():
     track = bouncing(np.random.default_rng(5))
     for method in ("smoother", "online", "ekf", "sliding-window"):
