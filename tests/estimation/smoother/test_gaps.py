@@ -19,9 +19,11 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import COEFFICIENTS
 from ballfg.tracks import Track
 
-G, E, NOISE, RATE, GAP = 9.81, 0.9, 0.005, 60.0, 0.4
+G, E, NOISE, NOISY, RATE, GAP = 9.81, 0.9, 0.005, 0.02, 60.0, 0.4
 MODEL = AnalyticModel([EFFECTS["gravity"](g=G), EFFECTS["restitution"](e=E), EFFECTS["table_height"](offset=0.0)])
-SMOOTHER = Smoother(MODEL, 0.0, Settings.for_measured(MODEL, position_noise=(NOISE,) * 3))
+SMOOTHER, OF_NOISY = (
+    Smoother(MODEL, 0.0, Settings.for_measured(MODEL, position_noise=(noise,) * 3)) for noise in (NOISE, NOISY)
+)
 ALONG = (4.0, 0.3)
 """m/s, along the table."""
 
@@ -41,6 +43,16 @@ def heights(times: np.ndarray, height: float, rise: float) -> tuple[np.ndarray, 
     return z, v, np.array(bounces)
 
 
+def measured(
+    times: np.ndarray, height: float, rise: float, noise: float, rng: np.random.Generator
+) -> tuple[Track, np.ndarray, np.ndarray]:
+    """A track, its true places and velocities (n, 6), and the times of all bounces."""
+    z, v, bounces = heights(times, height, rise)
+    across = [speed * times for speed in ALONG]
+    truth = np.column_stack((*across, z + MODEL.radius, np.tile(ALONG, (len(times), 1)), v))
+    return Track(times, truth[:, :3] + noise * rng.normal(size=(len(times), 3))), truth, bounces
+
+
 def with_a_gap(seed: int) -> tuple[Track, np.ndarray, np.ndarray]:
     """A track without samples for a while, its true places and velocities (n, 6), and the times of all bounces."""
     rng = np.random.default_rng(seed)
@@ -48,10 +60,18 @@ def with_a_gap(seed: int) -> tuple[Track, np.ndarray, np.ndarray]:
     begin = rng.uniform(0.06, last - GAP - 0.1)
     times = np.arange(0.0, last, 1.0 / RATE)
     times = times[(times < begin) | (times > begin + GAP)]
-    z, v, bounces = heights(times, rng.uniform(0.05, 0.4), rng.uniform(-1.0, 1.5))
-    across = [speed * times for speed in ALONG]
-    truth = np.column_stack((*across, z + MODEL.radius, np.tile(ALONG, (len(times), 1)), v))
-    return Track(times, truth[:, :3] + NOISE * rng.normal(size=(len(times), 3))), truth, bounces
+    return measured(times, rng.uniform(0.05, 0.4), rng.uniform(-1.0, 1.5), NOISE, rng)
+
+
+def with_two_gaps(seed: int) -> tuple[Track, np.ndarray, np.ndarray]:
+    """Likewise, with few and noisy samples between two gaps."""
+    rng = np.random.default_rng(seed)
+    first, between, rest = rng.uniform((0.15, 0.1, 0.1), (0.3, 0.2, 0.3))
+    gaps = rng.uniform(0.3, 0.48, 2)
+    again = first + gaps[0] + between
+    times = np.arange(0.0, again + gaps[1] + rest, 1.0 / RATE)
+    times = times[(times < first) | ((times > first + gaps[0]) & (times < again)) | (times > again + gaps[1])]
+    return measured(times, rng.uniform(0.05, 0.3), rng.uniform(-1.0, 1.0), NOISY, rng)
 
 
 @pytest.mark.parametrize("seed", range(24))
@@ -83,6 +103,16 @@ def test_a_stroke_in_a_gap_is_a_hit(seed: int) -> None:
     truth = np.column_stack((x, 0.3 * times, z + MODEL.radius, speed, np.full(len(x), 0.3), v))[seen]
     found = SMOOTHER.estimate(Track(times[seen], truth[:, :3] + NOISE * rng.normal(size=(seen.sum(), 3))))
     assert found.hits.tolist() == [int(np.diff(times[seen]).argmax())]
+    off = found.states[:, :6] - truth
+    assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[:, :6, :6]), off).max() < 40.0
+
+
+@pytest.mark.parametrize("seed", [13, 20, 27, 37, 58])
+def test_bounces_in_two_gaps_are_counted_together(seed: int) -> None:
+    """With a wrong number in the other gap, neither right number alone was more probable."""
+    track, truth, bounces = with_two_gaps(seed)
+    found = OF_NOISY.estimate(track)
+    assert [contact.time for contact in found.contacts] == pytest.approx(bounces, abs=0.1)
     off = found.states[:, :6] - truth
     assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariances[:, :6, :6]), off).max() < 40.0
 

@@ -6,7 +6,7 @@ gap. So the samples near a gap are explained again, each side by itself, with ot
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -42,6 +42,8 @@ QUICK: Final = 20
 UNSURE: Final = (
     "how the ball bounced where samples are missing is not certain: covariances hold what is nearly as probable"
 )
+PASSES: Final = 3
+"""Largest number of passes over several gaps, until none changes."""
 APART: Final = -math.log(CERTAIN)
 """nats, by which an explanation is so much less probable than another one that it is left out."""
 
@@ -52,46 +54,81 @@ def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> So
     Args: problem, solution: with the events that the whole track shows.
     Returns: a problem and its solution, whose `others` are nearly as probable.
     """
-    others = list[Solved]()
-    for gap in _gaps(problem.track, solution.events.segmentation):
-        begin, near = _beside(problem.track, gap)
-        local = _Local(smoother, near, gap - begin)
-        counts = _inside(solution.events.contacts, gap), _foretold(smoother, problem, solution, gap)
-        for events in local.likely(*counts):
-            known = replace(solution.events.segmentation, contacts=solution.events.contacts)
-            if _alike(known, spliced := _spliced(known, shifted(events, begin), begin, gap), gap):
-                continue
-            other = smoother.problem(problem.track, spliced)
-            other.added += problem.added
-            found = smoother.settle(other)
-            if _evidence(other, found) > _evidence(problem, solution):
-                (problem, solution), (other, found) = (other, found), (problem, solution)
-            others.append((other, found))
-    best = _evidence(problem, solution)
-    rivals = (Other(*other, best - _evidence(*other)) for other in others)
-    return problem, replace(solution, others=tuple(one for one in rivals if one.odds < APART))
+    longest, best = _longest_step(problem.track), (problem, solution)
+    near = {gap: found for gap in _gaps(*best, longest) if (found := _near(smoother, *best, gap, longest))}
+    if len(near) > 1:  # beside a wrong number in one gap, the right one in another may seem less probable
+        together = _events_of(solution)
+        for gap, (likeliest, *_) in near.items():
+            together = _spliced(together, likeliest, gap)
+        best = max(best, _settled(smoother, best, together, near) or best, key=_evidence)
+    for _ in range(PASSES if len(near) > 1 else 1):  # beside another number, other numbers may be in doubt
+        others, before = list[Solved](), best
+        for gap, explanations in near.items():
+            for events in explanations:
+                other = _settled(smoother, best, _spliced(_events_of(best[1]), events, gap), [gap])
+                if other is None:
+                    continue
+                other, best = sorted((other, best), key=_evidence)
+                if not _alike(_events_of(other[1]), _events_of(best[1]), gap):
+                    others.append(other)
+        if best is before:
+            break
+    highest = _evidence(best)
+    rivals = (Other(*other, highest - _evidence(other)) for other in others)
+    return best[0], replace(best[1], others=tuple(one for one in rivals if one.odds < APART))
 
 
-def _gaps(track: Track, events: Segmentation) -> list[int]:
-    """The intervals without samples in which a ball may have bounced unseen.
+def _settled(smoother: Smoother, solved: Solved, events: Segmentation, gaps: Iterable[int]) -> Solved | None:
+    """The whole track with other events; None if they are no others in these gaps."""
+    problem, solution = solved
+    if all(_alike(_events_of(solution), events, gap) for gap in gaps):
+        return None
+    other = smoother.problem(problem.track, events)
+    other.added += problem.added
+    return other, smoother.settle(other)
 
-    They are longer than those over which the segmentation follows hits, but not so long that nothing links their sides.
+
+def _events_of(solution: Solution) -> Segmentation:
+    """The events of a solution, its contacts included."""
+    return replace(solution.events.segmentation, contacts=solution.events.contacts)
+
+
+def _longest_step(track: Track) -> float:
+    """s, beyond which an interval is a gap: longer than those over which the segmentation follows hits."""
+    return max(USUAL.short_gap, MANY_STEPS * float(np.median(np.diff(track.times))))
+
+
+def _gaps(problem: TrackProblem, solution: Solution, longest: float) -> list[int]:
+    """The gaps in which a ball may have bounced unseen: not so long that nothing links their sides.
+
     Observations that state their own events state those in gaps, too.
     """
+    track = problem.track
     if any(observation.segmentation() is not None for observation in track.observations):
         return []
     steps = np.diff(track.times)
-    long = steps > max(USUAL.short_gap, MANY_STEPS * float(np.median(steps)))
-    long &= steps <= USUAL.longest_gap
-    for rest in events.rests:
+    long = (steps > longest) & (steps <= USUAL.longest_gap)
+    for rest in solution.events.segmentation.rests:
         long[rest.first : rest.last + 1] = False
     return [int(interval) for interval in np.flatnonzero(long)]
 
 
-def _beside(track: Track, gap: int) -> tuple[int, Track]:
-    """The number of the first sample near a gap, and the part of the track near it."""
-    start, end = track.times[gap] - REACH, track.times[gap + 1] + REACH
-    return int(np.searchsorted(track.times, start)), track.between(start, end)
+def _near(
+    smoother: Smoother, problem: TrackProblem, solution: Solution, gap: int, longest: float
+) -> list[tuple[int, Segmentation]]:
+    """The likely events of the samples near a gap, most probable first, each with the number of its first sample."""
+    begin, track = _beside(problem.track, gap, longest)
+    local = _Local(smoother, track, gap - begin, longest)
+    counts = _inside(solution.events.contacts, gap), _foretold(smoother, problem, solution, gap)
+    return [(begin, shifted(events, begin)) for events in local.likely(*counts)]
+
+
+def _beside(track: Track, gap: int, longest: float) -> tuple[int, Track]:
+    """The number of the first sample near a gap, and the part of the track near it, up to the next gaps."""
+    times, gaps = track.times, np.flatnonzero(np.diff(track.times) > longest)
+    begin = max(int(np.searchsorted(times, times[gap] - REACH)), *(gaps[gaps < gap] + 1).tolist()[-1:], 0)
+    end = min(times[gap + 1] + REACH, *times[gaps[gaps > gap]].tolist()[:1], times[-1])
+    return begin, track.between(float(times[begin]), float(end))
 
 
 @dataclass
@@ -101,10 +138,11 @@ class _Local:
     smoother: Smoother
     track: Track
     gap: int
+    longest: float
     explained: dict[int, tuple[float, Segmentation]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.apart = self.smoother.segment(self.track, USUAL.short_gap)
+        self.apart = self.smoother.segment(self.track, self.longest)
         calm = replace(self.smoother.settings, find_events=False)  # a wrong number would ask for hits
         quick = replace(self.smoother.optimizer, max_iterations=QUICK, tolerance=ROUGH)
         self.calm = Smoother(self.smoother.model, self.smoother.surfaces, calm, quick)
@@ -125,11 +163,10 @@ class _Local:
 
     def _evidence(self, count: int) -> float:
         if count not in self.explained:
-            events = _with_contacts(self.apart, self.track, self.smoother.surfaces, self.gap, count)
-            problem = self.calm.problem(self.track, events)
-            solution = self.calm.settle(problem)
-            found = replace(solution.events.segmentation, contacts=solution.events.contacts)
-            self.explained[count] = _evidence(problem, solution), found
+            start = _with_contacts(self.apart, self.track, self.smoother.surfaces, self.gap, count)
+            problem = self.calm.problem(self.track, start)
+            solved = problem, self.calm.settle(problem)
+            self.explained[count] = _evidence(solved), _events_of(solved[1])
         return self.explained[count][0]
 
 
@@ -156,11 +193,12 @@ def _heights_below(surfaces: Surfaces, track: Track, gap: int, parts: Array) -> 
     return heights
 
 
-def _spliced(known: Segmentation, near: Segmentation, begin: int, gap: int) -> Segmentation:
+def _spliced(known: Segmentation, explained: tuple[int, Segmentation], gap: int) -> Segmentation:
     """Events of a whole track, with others near a gap: between samples far from the events of both.
 
-    Args: near: of the samples from `begin` on, with their numbers in the track.
+    Args: explained: number of the first sample near the gap, and the events of these samples, numbered in the track.
     """
+    begin, near = explained
     end = begin + len(near.quality) - 1
     at = [one.interval for events in (known, near) for one in events.contacts]
     at += np.concatenate(
@@ -212,8 +250,9 @@ def _inside(contacts: Sequence[Contact], gap: int) -> int:
     return sum(contact.interval == gap for contact in contacts)
 
 
-def _evidence(problem: TrackProblem, solution: Solution) -> float:
+def _evidence(solved: Solved) -> float:
     """nats, less the prices of contacts and hits; -inf without a minimum."""
+    problem, solution = solved
     if solution.minimum.step is None:
         return -math.inf
     events = solution.events
