@@ -112,9 +112,7 @@ class Smoother(Estimator):
             return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem, *rivals = smoother.problems(track.since_first())
-            problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
-            problem, solution = smoother.bridged(problem, solution)
+            problem, solution = smoother.solved(track.since_first())
             found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
@@ -277,14 +275,16 @@ class Smoother(Estimator):
         """
         rival: Solved | None = from_before_a_bounce(self, problem, solution) if begins else None
         odds = np.inf if rival is None else log_evidence(solution) - log_evidence(rival[1])
+        others = solution.others
         if rival is not None and odds < 0.0:
+            others = tuple(one._replace(odds=one.odds - odds) for one in others)
             (problem, solution), rival, odds = rival, (problem, solution), -odds
         known = self.optimizer.covariances(solution.graph, solution.minimum)
         estimate = self.at_minimum(problem, solution, known)
         if rival is not None:
             other = self.at_minimum(*rival, self.optimizer.covariances(rival[1].graph, rival[1].minimum))
             estimate = with_other_beginning(estimate, other, odds)
-        for one in solution.others:
+        for one in others:
             from ballfg.estimation.smoother.second_look.gaps import with_other_contacts
 
             known = self.optimizer.covariances(one.solution.graph, one.solution.minimum)

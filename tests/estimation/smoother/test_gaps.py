@@ -13,7 +13,7 @@ from ballfg.estimation.online.online import Online
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.second_look.at_end import log_evidence
+from ballfg.estimation.smoother.second_look.at_end import from_before_a_bounce, log_evidence
 from ballfg.estimation.smoother.second_look.gaps import UNSURE, with_other_contacts
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import COEFFICIENTS
@@ -162,6 +162,25 @@ def test_what_is_nearly_as_probable_is_in_the_covariance() -> None:
     assert np.linalg.eigvalsh(held.covariances - mixture).min() > -1e-9 * np.abs(mixture).max()
     assert with_other_contacts(held, moved, 2.0).notes == (*one.notes, UNSURE)
     assert with_other_contacts(one, moved, 12.0) is one
+
+
+def test_doubts_about_a_gap_outlast_another_beginning() -> None:
+    """A ball that rises from the table at first was probably about to bounce, by 1.1 nats; the gap stays in doubt."""
+    rng = np.random.default_rng(265)
+    fall, speed = rng.uniform((0.0005, 1.5), (0.006, 3.5))
+    height = speed * fall + 0.5 * G * fall**2
+    last, begin, gap = rng.uniform((0.7, 0.08, 0.3), (1.0, 0.2, 0.45))
+    times = np.arange(0.0, last, 1.0 / RATE)
+    track, _, _ = measured(times[(times < begin) | (times > begin + gap)], height, -speed, NOISY, rng)
+    problem, solution = OF_NOISY.solved(track)
+    (other,), rival = solution.others, from_before_a_bounce(OF_NOISY, problem, solution)
+    assert rival is not None
+    odds = log_evidence(rival[1]) - log_evidence(solution)
+    assert odds > 0.0
+    sure, held = (OF_NOISY.result(problem, one) for one in (replace(solution, others=()), solution))
+    jump = (other.solution.minimum.values.states - sure.states)[:, :, None]
+    mixture = sure.covariances + jump * jump.swapaxes(1, 2) / (1.0 + np.exp(other.odds + odds))
+    assert np.linalg.eigvalsh(held.covariances - mixture).min() > -1e-9 * np.abs(mixture).max()
 
 
 def test_the_evidence_is_that_of_a_dense_gaussian() -> None:
