@@ -19,7 +19,7 @@ class GenericTest:
 
     Attributes:
         name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
-            against flights), `time` (whiteness along the tracks) `tracks` (the same, where each track's own
+            against flights), `time` (whiteness along the tracks), `tracks` (the same, where each track's own
             coefficients explain it) or `predictions` (errors on the held-out half against the noise).
         where: place, dependence and size of the pattern in words.
         p_value: probability of such a pattern by chance; for `label`, that every label is right.

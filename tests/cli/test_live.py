@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.dynamics import nominal_model
-from ballfg.estimation import Online, dataset_settings, dataset_surfaces
+from ballfg.dynamics import nominal_model, save_model
+from ballfg.dynamics.population import SpinGroup, SpinPopulation
+from ballfg.estimation import Online, Settings, dataset_settings, dataset_surfaces
 from ballfg.live.session import Session
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
@@ -143,6 +144,23 @@ def test_senders_that_talk_nonsense_and_break_off_do_not_hurt_the_next_ball(data
     text = said.decode()
     assert "2 too old, 0 repeated, 3 malformed" in text
     assert "1 clocks begun anew" in text
+
+
+def test_a_stream_without_a_group_may_be_of_one_that_the_model_does_not_know(tmp_path: Path) -> None:
+    """One known group and the usual prior of 60 rad/s, each by a half: the law of total variance, by hand."""
+    model = nominal_model()
+    model.spins = SpinPopulation("player", {"ann": SpinGroup((0.0, 150.0, 0.0), (4.0, 12.0, 8.0), 10)})
+    save_model(model, tmp_path / "model.yaml")
+    lines = b"".join(f"{t},{3.0 * t},0.0,{0.5 + t - 4.905 * t**2}\n".encode() for t in (0.0, 0.02, 0.04))
+    with started("--model", tmp_path / "model.yaml") as process:
+        out, err = process.communicate(lines)
+    covariance = np.array(lines_of(out)[-2]["covariance"])[6:, 6:]
+    usual = Settings.for_measured(model).spin_prior
+    across = (12.0**2 + usual**2) / 2.0 + 150.0**2 / 4.0
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(
+        [np.sqrt((4.0**2 + usual**2) / 2.0), np.sqrt(across), np.sqrt((8.0**2 + usual**2) / 2.0)], rel=0.05
+    )
+    assert b"the stream names no group (player): balls get the mixture of its groups, ann" in err
 
 
 def test_a_closed_pipe_ends_it_cleanly(dataset: Path) -> None:

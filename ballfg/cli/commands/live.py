@@ -167,8 +167,13 @@ def _scene(
     if noise is not None:
         sigma = check_number("noise", noise, "m", above=0.0, limit=1.0, instead="mm")
         settings = replace(settings, position_noise=(sigma,) * 3)
-    if data is None or group is not None:
-        settings = replace(settings, spins=ball.spins, group=group)
+    spins = ball.spins
+    if group is not None:
+        settings = replace(settings, spins=spins, group=group)
+    elif spins is not None and settings.group is None:
+        if data is None:
+            settings = replace(settings, spins=spins.with_unseen(settings.spin_prior))
+        print_notes([f"the stream names no group ({spins.by}): balls get {spins.of_others}. --group NAME gives one"])
     return ball, surfaces, settings
 
 
