@@ -131,6 +131,24 @@ def test_a_stream_does_not_guess_the_bounces_in_a_gap(seed: int) -> None:
     assert [contact.time for contact in found.contacts] == pytest.approx(bounces, abs=0.06)
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_a_bounce_before_the_last_sample_is_as_uncertain_before_a_pause_as_at_the_end(seed: int) -> None:
+    """Nothing links the sides of a pause of a second; its last sample seemed to be an outlier of a falling ball."""
+    rng, speed = np.random.default_rng(seed), 1.5
+    bounce = rng.uniform(0.27, 0.2835)
+    times = np.arange(np.ceil(RATE * bounce) + 1) / RATE
+    first, truth, _ = measured(times, speed * bounce - 0.5 * G * bounce**2, G * bounce - speed, NOISE, rng)
+    later = 1.0 + times[-1] + np.arange(30) / RATE
+    again = np.column_stack((4.0 * later, 0.3 * later, 1.0 + MODEL.radius - 0.5 * G * (later - later[0]) ** 2))
+    again += NOISE * rng.normal(size=again.shape)
+    track = Track(np.append(times, later), np.concatenate((first.positions, again)))
+    found, alone = SMOOTHER.estimate(track), SMOOTHER.estimate(first)
+    k = len(first) - 1
+    off = found.states[k, :6] - truth[k]
+    assert off @ np.linalg.solve(found.covariances[k, :6, :6], off) < 30.0
+    np.testing.assert_allclose(found.states[k, :6], alone.states[k, :6], atol=0.05)
+
+
 def test_a_gap_is_no_hand() -> None:
     """Each side of a gap with two bounces in it is a flight."""
     track, _, bounces = with_a_gap(22)

@@ -1,9 +1,11 @@
-"""Estimates the last state of a track that ends near a contact, and the first of one that begins there.
+"""Estimates the last state of a track, or before a restart, that is near a contact, and a first state near one.
 
 No sample beyond shows the side there.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -15,7 +17,7 @@ from ballfg.dynamics.motion.contact import bounced, gap_jacobian
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.estimation.sides.hypotheses import HypothesisModel, measured_at
-from ballfg.estimation.sides.monitor import ContactMonitor, widening, with_contact_states
+from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, widening, with_contact_states
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.settle import LEAST_FALL, Earlier, Solution
 from ballfg.factors.batch import Values
@@ -43,36 +45,51 @@ Solved = tuple[TrackProblem, Solution]
 
 
 def with_both_sides(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
-    """The estimate; if the track ends near a contact, its last state is that of the more probable side.
+    """The estimate; where it ends near a contact, its last state is that of the more probable side.
 
-    The samples before the contact are estimated by themselves; from there on both hypotheses are followed
-    (`ballfg.estimation.sides`).
+    It ends with the track, and before each gap over which nothing is known. The samples before the contact are
+    estimated by themselves; from there on both hypotheses are followed (`ballfg.estimation.sides`).
     """
-    track, n = problem.track, len(problem.track)
-    disturbed = np.concatenate((estimate.hits, problem.segmentation.restarts))
-    first = _before_contact(estimate, HypothesisModel(problem.ball, smoother.surfaces, problem.settings), track)
-    if estimate.status.failed or first is None or first + 1 < LEAST or (disturbed >= first).any():
-        return estimate
-    before = _filtered(smoother, track.between(track.times[max(first + 1 - MEMORY, 0)], track.times[first]))
+    edges = [0, *(np.unique(problem.segmentation.restarts) + 1).tolist(), len(problem.track)]
+    found = {end - 1: _at_end(smoother, problem, estimate, begin, end) for begin, end in pairwise(edges)}
+    states = {last: state for last, state in found.items() if state is not None}
+    return with_contact_states(estimate, states) if states else estimate
+
+
+def _at_end(
+    smoother: "Smoother", problem: TrackProblem, estimate: Estimate, begin: int, end: int
+) -> ContactState | None:
+    """The last state of the samples begin to end - 1, between which no restart lies; None if no contact is near."""
+    track, model = problem.track, HypothesisModel(problem.ball, smoother.surfaces, problem.settings)
+    intervals = [contact.interval for contact in estimate.contacts if contact.interval < end - 1]
+    first = _before_contact(estimate, model, track, intervals, end)
+    if estimate.status.failed or first is None or first + 1 - begin < LEAST:
+        return None
+    if ((estimate.hits >= first) & (estimate.hits < end - 1)).any():
+        return None
+    before = _filtered(smoother, track.between(track.times[max(first + 1 - MEMORY, begin)], track.times[first]))
     if before is None:
-        return estimate
+        return None
     biases = len(before[0]) - STATE_DIM - problem.width
     model = HypothesisModel(problem.ball, smoother.surfaces, problem.settings, biases)
     beside = {one: problem.observed[one.name] for one in problem.observations if not one.locates}
-    measured = (measured_at(track, problem.sigma, beside, k) for k in range(first + 1, n))
-    steps = list(zip(np.diff(track.times[first:]).tolist(), measured, strict=True))
-    latest = max((contact.interval for contact in estimate.contacts), default=-1)
-    state = ContactMonitor(model).run(before, steps, lambda count: latest >= n - 1 - count)
-    return estimate if state is None else with_contact_states(estimate, {n - 1: state})
+    measured = (measured_at(track, problem.sigma, beside, k) for k in range(first + 1, end))
+    steps = list(zip(np.diff(track.times[first:end]).tolist(), measured, strict=True))
+    latest = max(intervals, default=-1)
+    return ContactMonitor(model).run(before, steps, lambda count: latest >= end - 1 - count)
 
 
-def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) -> int | None:
-    """The last sample that is certainly before a contact near the track's end; None without such a contact."""
-    n = len(track)
-    near = [contact.interval for contact in estimate.contacts if contact.interval >= n - 1 - REACH]
+def _before_contact(
+    estimate: Estimate, model: HypothesisModel, track: Track, intervals: Sequence[int], end: int
+) -> int | None:
+    """The last sample that is certainly before a contact near sample end - 1; None without such a contact.
+
+    Args: intervals: of the contacts before.
+    """
+    near = [interval for interval in intervals if interval >= end - 1 - REACH]
     if near:
         return near[0] - 1
-    for k in range(max(n - 1 - REACH, 0), n - 1):
+    for k in range(max(end - 1 - REACH, 0), end - 1):
         state = estimate[k]
         if model.may_touch(state.mean, state.joint, float(track.times[k + 1] - track.times[k])):
             return k
