@@ -112,7 +112,9 @@ class Smoother(Estimator):
             return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem, solution = smoother.solved(track.since_first())
+            problem, *rivals = smoother.problems(track.since_first())  # as `solved`, which would lengthen the way
+            problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
+            problem, solution = smoother.bridged(problem, solution)
             found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
