@@ -24,7 +24,7 @@ from ballfg.estimation.sides.monitor import widening
 from ballfg.estimation.smoother.pieces.section import shifted
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import CERTAIN, Solved, log_evidence
-from ballfg.estimation.smoother.settle import ROUGH, Other, Solution
+from ballfg.estimation.smoother.settle import ROUGH, Other, Solution, places_of
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.state import Z
 from ballfg.tracks import Track
@@ -42,10 +42,15 @@ QUICK: Final = 20
 UNSURE: Final = (
     "how the ball bounced where samples are missing is not certain: covariances hold what is nearly as probable"
 )
+LIKELY: Final = 2
+"""Largest number of explanations of a gap that are solved on the whole track."""
 PASSES: Final = 3
 """Largest number of passes over several gaps, until none changes."""
 APART: Final = -math.log(CERTAIN)
 """nats, by which an explanation is so much less probable than another one that it is left out."""
+
+Key = tuple[tuple[tuple[int, float], ...], tuple[int, ...], tuple[int, ...]]
+"""The places of all contacts, the hits and the qualities of the samples: what tells one explanation from another."""
 
 
 def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> Solved:
@@ -54,18 +59,18 @@ def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> So
     Args: problem, solution: with the events that the whole track shows.
     Returns: a problem and its solution, whose `others` are nearly as probable.
     """
-    longest, best = _longest_step(problem.track), (problem, solution)
+    longest, best, solved = _longest_step(problem.track), (problem, solution), dict[Key, Solved]()
     near = {gap: found for gap in _gaps(*best, longest) if (found := _near(smoother, *best, gap, longest))}
     if len(near) > 1:  # beside a wrong number in one gap, the right one in another may seem less probable
         together = _events_of(solution)
         for gap, (likeliest, *_) in near.items():
             together = _spliced(together, likeliest, gap)
-        best = max(best, _settled(smoother, best, together, near) or best, key=_evidence)
+        best = max(best, _settled(smoother, best, together, near, solved) or best, key=_evidence)
     for _ in range(PASSES if len(near) > 1 else 1):  # beside another number, other numbers may be in doubt
         others, before = list[Solved](), best
         for gap, explanations in near.items():
             for events in explanations:
-                other = _settled(smoother, best, _spliced(_events_of(best[1]), events, gap), [gap])
+                other = _settled(smoother, best, _spliced(_events_of(best[1]), events, gap), [gap], solved)
                 if other is None:
                     continue
                 other, best = sorted((other, best), key=_evidence)
@@ -78,14 +83,19 @@ def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> So
     return best[0], replace(best[1], others=tuple(one for one in rivals if one.odds < APART))
 
 
-def _settled(smoother: Smoother, solved: Solved, events: Segmentation, gaps: Iterable[int]) -> Solved | None:
-    """The whole track with other events; None if they are no others in these gaps."""
-    problem, solution = solved
+def _settled(
+    smoother: Smoother, best: Solved, events: Segmentation, gaps: Iterable[int], solved: dict[Key, Solved]
+) -> Solved | None:
+    """The whole track with other events; None if they are no others in these gaps. solved: by its events, if before."""
+    problem, solution = best
     if all(_alike(_events_of(solution), events, gap) for gap in gaps):
         return None
-    other = smoother.problem(problem.track, events)
-    other.added += problem.added
-    return other, smoother.settle(other)
+    key = places_of(events.contacts), tuple(events.hits.tolist()), tuple(events.quality.tolist())
+    if key not in solved:
+        other = smoother.problem(problem.track, events)
+        other.added += problem.added
+        solved[key] = other, smoother.settle(other)
+    return solved[key]
 
 
 def _events_of(solution: Solution) -> Segmentation:
@@ -159,7 +169,7 @@ class _Local:
                 while best + change >= 0 and self._evidence(best + change) > self._evidence(best):
                     best += change
         ranked = sorted(self.explained.values(), key=lambda known: -known[0])
-        yield from (events for evidence, events in ranked if evidence > ranked[0][0] - APART)
+        yield from (events for evidence, events in ranked[:LIKELY] if evidence > ranked[0][0] - APART)
 
     def _evidence(self, count: int) -> float:
         if count not in self.explained:
