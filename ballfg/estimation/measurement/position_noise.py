@@ -37,9 +37,9 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     """The standard deviation of each coordinate, for data that does not state it.
 
     A cubic is fitted to each window of 11 samples, or 9 or 7 where a track is too slow or too short for more, without
-    the middle one, and predicts that one. The residuals, divided
-    by the growth of the noise in such a prediction, have the standard deviation sought; their median absolute value
-    gives it regardless of a few bad ones. Windows with a bounce, a hit or an outlier are rejected.
+    the middle one, and predicts that one. The residuals, divided by the growth of the noise in such a prediction, have
+    the standard deviation sought; their median absolute value gives it regardless of a few bad ones. Windows with a
+    bounce, a hit or an outlier are rejected.
 
     Noise with a memory longer than the window (calibration, a shifted tracker) does not show; stamp jitter does, along
     the flight.

@@ -54,7 +54,7 @@ def hit(
     at = h.mean[:, 0].copy() if dt < scene.short_gap else sample.position
     reach = scene.hit_spread**2 + (scene.velocity_spread * min(dt, scene.short_gap)) ** 2
     _forget(h, at, reach, scene)
-    h.score -= rarity(scene.hit_rate, dt) + scene.hit_cost * math.exp(-dt / scene.short_gap)
+    h.score -= hit_price(scene.hit_rate, scene.hit_cost, scene.short_gap, dt)
     bank.pass_through(h, work, HIT, sample.number - 1, -1, sample.time)
     _rested(work, row, sample, scene, surfaces)
 
@@ -67,7 +67,7 @@ def shift(work: bank.Work, predicted: bank.Records, sample: bank.Sample, dt: flo
     bank.rank(predicted, 0, n, rows)
     for row in rows[:SHIFTED_PREDICTIONS]:
         h = held[bank.add(work, predicted, row)]
-        h.score = h.score - rarity(scene.shift_rate, dt) - scene.shift_cost
+        h.score = h.score - _rarity(scene.shift_rate, dt) - scene.shift_cost
         h.age = 0
         bank.pass_through(h, work, SHIFT, sample.number - 1, -1, sample.time)
         for axis in range(3):
@@ -95,7 +95,7 @@ def leave(work: bank.Work, predicted: bank.Records, sample: bank.Sample, dt: flo
     h = work.bank[bank.add(work, predicted, best)]
     bank.pass_through(h, work, LEAVE, sample.number - 1, h.surface, sample.time)
     lift(h, scene)
-    h.score = h.score - rarity(scene.hit_rate, dt) - scene.leave_cost
+    h.score = h.score - _rarity(scene.hit_rate, dt) - scene.leave_cost
     h.age = 0
 
 
@@ -127,9 +127,15 @@ def _rested(work: bank.Work, row: int, sample: bank.Sample, scene: bank.Record, 
 
 
 @machine_code(REAL(REAL, REAL))
-def rarity(rate: float, dt: float) -> float:
+def _rarity(rate: float, dt: float) -> float:
     """nats, minus log probability of an event with a rate (1/s) in an interval."""
     return -math.log(-math.expm1(-rate * max(dt, SHORTEST_STEP)))
+
+
+@machine_code(REAL(REAL, REAL, REAL, REAL))
+def hit_price(rate: float, cost: float, short_gap: float, dt: float) -> float:
+    """nats, of a hit in an interval of dt s; arguments as in `SegmentationSettings`."""
+    return _rarity(rate, dt) + cost * math.exp(-dt / short_gap)
 
 
 SERIES: Final = 32

@@ -5,7 +5,7 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.segmentation.batch import segment
-from ballfg.estimation.segmentation.explain import rarity
+from ballfg.estimation.segmentation.explain import _rarity
 from ballfg.estimation.segmentation.result import Quality
 
 TABLE = Surfaces(0.75)
@@ -169,6 +169,6 @@ def test_bad_input_is_named(times, positions, sigma, message):
 
 def test_an_event_costs_what_chance_says_and_no_more_for_closer_stamps() -> None:
     """Of a Poisson process with 50 events a second, minus the log probability of one within dt; below 1 ms alike."""
-    assert rarity(50.0, 0.01) == pytest.approx(-np.log(1.0 - np.exp(-0.5)))
-    assert rarity(50.0, 0.0015) == pytest.approx(-np.log(1.0 - np.exp(-0.075)))
-    assert rarity(50.0, 1e-6) == rarity(50.0, 0.001)
+    assert _rarity(50.0, 0.01) == pytest.approx(-np.log(1.0 - np.exp(-0.5)))
+    assert _rarity(50.0, 0.0015) == pytest.approx(-np.log(1.0 - np.exp(-0.075)))
+    assert _rarity(50.0, 1e-6) == _rarity(50.0, 0.001)

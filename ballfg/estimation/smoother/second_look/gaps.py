@@ -17,7 +17,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation.explain import rarity
+from ballfg.estimation.segmentation.explain import hit_price
 from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.segmentation.segmenter import USUAL
 from ballfg.estimation.sides.monitor import widening
@@ -38,7 +38,7 @@ HIT: Final = -1
 MOST: Final = 8
 """Largest number of contacts that the motion before a gap may foretell."""
 QUICK: Final = 20
-"""Largest number of linear solutions for an explanation: what needs more is improbable."""
+"""Largest number of linear solutions for an explanation: what needs more is improbable. 10 and 40 count alike."""
 UNSURE: Final = (
     "how the ball bounced where samples are missing is not certain: covariances hold what is nearly as probable"
 )
@@ -268,7 +268,7 @@ def _evidence(solved: Solved) -> float:
     events = solution.events
     price = USUAL.contact_cost * len(events.contacts)
     for step in np.diff(problem.track.times)[events.segmentation.hits].tolist():
-        price += rarity(USUAL.hit_rate, step) + USUAL.hit_cost * math.exp(-step / USUAL.short_gap)
+        price += hit_price(USUAL.hit_rate, USUAL.hit_cost, USUAL.short_gap, step)
     return log_evidence(solution) - price
 
 
