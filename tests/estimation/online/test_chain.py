@@ -85,6 +85,20 @@ def test_gaps_hits_and_outliers(track: Track, memory: float) -> None:
         clock += track.times[-1] + (0.02 if shot % 2 else 1.5)
 
 
+def test_cuts_where_later_states_were_eliminated_before_the_leaving_ones() -> None:
+    """A tracker's bias links shots over their pause; iSAM2's tree then has states that stay below ones that leave."""
+    model, config = nominal_model(), SimulationConfig(tracks=2, rate=200.0, seed=15)
+    chosen = Settings.for_measured(model, position_noise=(0.003,) * 3, memory=(0.004,) * 3, memory_time=0.05)
+    one, other = both(model, config.ball.surfaces, chosen, lag=20)
+    clock = 0.0
+    for shot in simulate(config):
+        for time, position in zip(shot.track.times, shot.track.positions, strict=True):
+            state = one.push(clock + time, position)
+            same(state, other.push(clock + time, position))
+            assert not state.rebuilt
+        clock += shot.track.times[-1] + 0.3
+
+
 def test_measurements_of_a_moment(track: Track) -> None:
     model = nominal_model()
     one, other = both(model, 0.0, own(model))

@@ -35,6 +35,14 @@ def linear_factor(
     return gtsam.LinearContainerFactor(factor, point)
 
 
+def linearized(factor: "gtsam.NonlinearFactor", point: "gtsam.Values") -> tuple[list[int], list[Array], Array]:
+    """A factor about a point, whitened: its keys, a block (r, w) of each, and the right side (r,)."""
+    keys = list(factor.keys())
+    matrix, right = factor.linearize(point).jacobian()
+    ends = np.cumsum([len(point.atVector(key)) for key in keys])
+    return keys, np.split(matrix, ends[:-1], axis=1), right
+
+
 def bias_start(key: int, settings: Settings) -> "gtsam.NonlinearFactor":
     """The prior of a state's bias, about zero."""
     return _of_biases(BiasStartFactors(np.array([key - STATE_KEY]), settings.bias_sigmas))
@@ -81,8 +89,7 @@ class LinearFactors(FactorBatch):
         at = gtsam.Values()
         for key, point in zip(keys, points, strict=True):
             at.insert(key, point[0])
-        matrix, b = factor.linearize(at).jacobian()
-        blocks = np.split(matrix, np.cumsum([point.shape[1] for point in points])[:-1], axis=1)
+        _, blocks, b = linearized(factor, at)
         return cls(numbers, points, blocks, b, values.biases is not None)
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:

@@ -238,11 +238,16 @@ class StreamWindow(ABC):
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
         """Moves states whose solution left the thresholds, and evaluates their factors, ahead of iSAM2.
 
+        What is known from removed states is linear about the points of the coefficients and of the first state, which
+        stay from then on.
+
         Returns: the new interval's propagation (9, 1 + 9 + p), factors evaluated, torch calls.
         """
         moved = np.asarray((np.abs(self.delta) > self.threshold).any(axis=1), dtype=bool)
         limit = COEFFICIENT_THRESHOLD * self._own_sigmas
-        shared = bool((np.abs(self.coefficient_delta) > limit).any())
+        shared = bool((np.abs(self.coefficient_delta) > limit).any()) and not self.first
+        if self.first and len(moved):
+            moved[0] &= not self._first_is_known()
         touched, begins = list[Interval](), list[int]()
         if moved.any():
             self.theta = np.where(moved[:, None], self.theta + self.delta, self.theta)

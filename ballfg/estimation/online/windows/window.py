@@ -4,7 +4,7 @@ The window evaluates factors ahead in batches; when GTSAM asks for one, its call
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Self
 
 import gtsam
@@ -12,7 +12,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
-from ballfg.estimation.online.windows.linear import LinearFactors, bias_link, bias_start, linear_factor
+from ballfg.estimation.online.windows.linear import LinearFactors, bias_link, bias_start, linear_factor, linearized
 from ballfg.estimation.online.windows.stream_window import COEFFICIENT_THRESHOLD, Arrival, StreamWindow
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
@@ -27,14 +27,14 @@ class IsamWindow(StreamWindow):
 
     Attributes:
         isam: of GTSAM.
-        shared: factors without a sample: the prior of the coefficients; after a cut, the linear factors that replaced
-            it and the removed states.
+        shared: factors without a sample: the prior of the coefficients and the linear factors of the removed states.
     """
 
     def _clear(self) -> None:
         """An empty iSAM2 and no states."""
         super()._clear()
         self.isam = self._new_isam()
+        self._shared_slots: list[int] = []  # of the shared factors in iSAM2
         if not self.first:
             prior = Bridge(coefficient_prior(self._own_means, self._own_sigmas), "row") if self.p else None
             self.shared: list[gtsam.NonlinearFactor] = [] if prior is None else [prior.factor(0)]
@@ -66,7 +66,9 @@ class IsamWindow(StreamWindow):
                 graph.push_back(factor)
             if self.p:
                 values.insert(COEFFICIENT_KEY, self.coefficient_theta)
-        slots = self._update(graph, values, [], last if self.p and older else {})
+        slots = self._update(graph, values, [], last if self.p and older else {}, self._fixed_keys())
+        if not older:
+            self._shared_slots = slots[len(slots) - len(self.shared) :]
         begin = 0
         for arrival, end in zip(arrivals, ends, strict=True):
             linked = self.biased and (older or begin > 0)
@@ -124,12 +126,14 @@ class IsamWindow(StreamWindow):
                 groups.insert2(key, group)
             how.constrainedKeys = groups
         if held:
-            staying = gtsam.KeyList()
-            for key in held:
-                staying.push_back(key)
-            how.noRelinKeys = staying
+            how.noRelinKeys = _key_list(held)
         self._result = self.isam.update(graph, values, how)
         return list(self._result.getNewFactorsIndices())
+
+    def _fixed_keys(self) -> list[int]:
+        """GTSAM's keys of the variables whose linearisation points a linear factor of removed states fixes."""
+        keys = [STATE_KEY + self.first] * self._first_is_known() + [COEFFICIENT_KEY] * (self.p > 0)
+        return keys if self.first else []
 
     def _keys(self) -> list[int]:
         """GTSAM's keys of all variables."""
@@ -179,7 +183,7 @@ class IsamWindow(StreamWindow):
         graph = gtsam.NonlinearFactorGraph()
         graph.push_back(measurement.factor(newest - STATE_KEY))
         last = {newest: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) > 1 else {}
-        slots = self._update(graph, gtsam.Values(), [], last)
+        slots = self._update(graph, gtsam.Values(), [], last, self._fixed_keys())
         sample = self.samples[-1]
         sample.slots = (*sample.slots, *slots)
         self._read_back()
@@ -197,26 +201,75 @@ class IsamWindow(StreamWindow):
         self._read_back()
 
     def shorten(self, keep: int) -> None:
-        """Drops all but the newest states; a linear factor on the first that stays keeps their information.
+        """Drops all but the newest states; linear factors on the first that stays keep their information.
 
-        The factors of the removed states are eliminated, by QR, at their linearisation points; iSAM2 is then rebuilt
-        from the others, whose linearisations are all at hand: no torch call. If only a bias links the first of these to
-        the removed ones, after a long gap, the bias restarts.
+        GTSAM takes the leaves off its tree: nothing is evaluated or eliminated again. If only a bias links the first
+        state that stays to the removed ones, after a long gap, the bias restarts.
 
         Raises: RuntimeError: from GTSAM, when the removed part is singular.
         """
         leaving = len(self.samples) - keep
-        before = self.first, self.samples, self.intervals, self.theta, self.delta, self.shared
-        linked = self.intervals[leaving - 1] is not None
+        if self.biased and self.intervals[leaving - 1] is None:
+            self._restart_bias(leaving)
+        made, removed = self._take_off(leaving)
+        point, held = self._point(leaving + 1), self.isam.getFactorsUnsafe()
+        known = [(slot, factor) for slot, factor in self._known() if slot not in removed]
+        known += [(slot, linear_factor(*linearized(held.at(slot), point), point)) for slot in made]
+        self.shared, self._shared_slots = [f for _, f in known], [slot for slot, _ in known]
+        self.first += leaving
+        self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
+        self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
+        self.samples[0].bias_slot = None
+        self._merge_shared()
+
+    def _known(self) -> list[tuple[int, gtsam.NonlinearFactor]]:
+        """The shared factors with their slots."""
+        return list(zip(self._shared_slots, self.shared, strict=True))
+
+    def _take_off(self, leaving: int) -> tuple[list[int], set[int]]:
+        """Removes the oldest states from iSAM2; slots of the linear factors in their place, and of all removed ones.
+
+        Raises: RuntimeError: from GTSAM, when the removed part is singular.
+        """
+        keys, n, whole = self._keys(), len(self.samples), gtsam.ISAM2(self.isam)
+        leaves = _key_list(keys[:leaving])
+        staying = self._slots(range(leaving, n), range(leaving, n - 1), range(leaving + 1, n))
         try:
-            self.shared = self._summary(leaving)
-            self.first += leaving
-            self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
-            self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
-            self._renew(linked)
-        except RuntimeError:
-            self.first, self.samples, self.intervals, self.theta, self.delta, self.shared = before
-            raise
+            made, removed = self.isam.marginalizeLeavesWithIndices(leaves)
+            below = not set(removed).isdisjoint(staying)
+        except (RuntimeError, ValueError):
+            below = True
+        if below:  # states that stay were eliminated before leaving ones, and GTSAM dropped them as well
+            self.isam = gtsam.ISAM2(whole)
+            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), _eliminating_last(keys[leaving:], keys))
+            made, removed = self.isam.marginalizeLeavesWithIndices(leaves)
+        return made, set(removed)
+
+    def _merge_shared(self) -> None:
+        """Keeps what is known of the coefficients alone in one factor, however often the window is cut."""
+        alone = [(slot, factor) for slot, factor in self._known() if list(factor.keys()) == [COEFFICIENT_KEY]]
+        if len(alone) < 2:
+            return
+        stacked, point = gtsam.GaussianFactorGraph(), self._point(0)
+        for _, factor in alone:
+            stacked.push_back(factor.linearize(point))
+        triangle = np.linalg.qr(stacked.augmentedJacobian(), mode="r")[: self.p]
+        merged, graph = (
+            linear_factor([COEFFICIENT_KEY], [triangle[:, :-1]], triangle[:, -1], point),
+            gtsam.NonlinearFactorGraph(),
+        )
+        graph.push_back(merged)
+        slots = [slot for slot, _ in alone]
+        rest = [(slot, factor) for slot, factor in self._known() if slot not in slots]
+        rest += zip(self._update(graph, gtsam.Values(), slots, {}, self._keys()), [merged], strict=True)
+        self.shared, self._shared_slots = [f for _, f in rest], [slot for slot, _ in rest]
+
+    def _restart_bias(self, k: int) -> None:
+        """Replaces the link of a state's bias to the one before by the prior of a bias."""
+        graph, sample = gtsam.NonlinearFactorGraph(), self.samples[k]
+        graph.push_back(bias_start(STATE_KEY + self.first + k, self.settings))
+        slots = self._update(graph, gtsam.Values(), [sample.bias_slot], {}, self._keys())
+        sample.slots, sample.bias_slot = (*sample.slots, *slots), None
 
     def joint_covariances(self, count: int) -> list[Array]:
         """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
@@ -227,25 +280,6 @@ class IsamWindow(StreamWindow):
         """The linear factors from removed states, about the present estimate."""
         values = self.values if self.first else None
         return [] if values is None else [LinearFactors.of_gtsam(f, values, self.first) for f in self.shared]
-
-    def _summary(self, leaving: int) -> list[gtsam.NonlinearFactor]:
-        """The information of the oldest states, as linear factors on the first that stays and on the coefficients."""
-        point = self._point(leaving + 1)
-        old = gtsam.GaussianFactorGraph()
-        cut = leaving - (self.intervals[leaving - 1] is None)
-        held, slots = self.isam.getFactorsUnsafe(), self._slots(range(leaving), range(leaving), range(1, cut + 1))
-        for factor in (*(held.at(slot) for slot in slots), *self.shared):
-            old.push_back(factor.linearize(point))
-        ordering = gtsam.Ordering()
-        present = set(old.keyVector())
-        for key in (*range(STATE_KEY + self.first, STATE_KEY + self.first + leaving + 1), COEFFICIENT_KEY):
-            if key in present:
-                ordering.push_back(key)
-        bayes_net = old.eliminateSequential(ordering, gtsam.EliminateQR)
-        conditionals = [bayes_net.at(i) for i in range(bayes_net.size())]  # by branches of the forest, not in order
-        gone = range(STATE_KEY + self.first, STATE_KEY + self.first + leaving)
-        rest = [c for c in conditionals if list(c.keys())[0] not in gone]  # noqa: RUF015
-        return [linear_factor(list(c.keys()), [c.R(), c.S()], c.d(), point) for c in rest]
 
     def _point(self, count: int) -> gtsam.Values:
         """The linearisation points of the first states of the window and of the coefficients."""
@@ -262,31 +296,23 @@ class IsamWindow(StreamWindow):
         slots += [i.slot for k in intervals if (i := self.intervals[k]) is not None and i.slot is not None]
         return slots + [slot for k in biases if (slot := self.samples[k].bias_slot) is not None]
 
-    def _renew(self, linked: bool) -> None:
-        """A new iSAM2 from the present window; its first state may have no link to the removed ones."""
-        n, held = len(self.samples), self.isam.getFactorsUnsafe()
-        graph = gtsam.NonlinearFactorGraph()
-        for slot in self._slots(range(n), range(n - 1), range(1, n)):
-            graph.push_back(held.at(slot))
-        self.samples[0].bias_slot = None
-        if self.biased and not linked:
-            graph.push_back(bias_start(STATE_KEY + self.first, self.settings))
-        for factor in self.shared:
-            graph.push_back(factor)
-        self.isam = self._new_isam()
-        last = {STATE_KEY + self.first + n - 1: 1, COEFFICIENT_KEY: 2} if self.p else {}
-        slots = iter(self._update(graph, self._point(n), [], last))
-        for sample in self.samples:
-            sample.slots = tuple(next(slots) for _ in sample.slots)
-        for interval in self.intervals:
-            if interval is not None:
-                interval.slot = next(slots)
-        for sample in self.samples[1:]:
-            if sample.bias_slot is not None:
-                sample.bias_slot = next(slots)
-        if self.biased and not linked:
-            self.samples[0].slots += (next(slots),)
-        self._read_back()
+
+def _eliminating_last(last: Sequence[int], every: Sequence[int]) -> gtsam.ISAM2UpdateParams:
+    """An update of iSAM2 that moves no point and eliminates all variables anew, some of them last."""
+    how, groups = gtsam.ISAM2UpdateParams(), gtsam.KeyGroupMap()
+    how.extraReelimKeys = how.noRelinKeys = _key_list(every)
+    for key in last:
+        groups.insert2(key, 2 if key == COEFFICIENT_KEY else 1)
+    how.constrainedKeys = groups
+    return how
+
+
+def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
+    """Keys as GTSAM takes them."""
+    found = gtsam.KeyList()
+    for key in keys:
+        found.push_back(key)
+    return found
 
 
 def _parameters(threshold: Array, coefficient_threshold: Array) -> gtsam.ISAM2Params:
