@@ -4,7 +4,7 @@ The window evaluates factors ahead in batches; when GTSAM asks for one, its call
 """
 
 import copy
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Self
 
 import gtsam
@@ -12,14 +12,12 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
+from ballfg.estimation.online.windows.isam import eliminating_last, key_list, parameters
 from ballfg.estimation.online.windows.linear import LinearFactors, bias_link, bias_start, linear_factor, linearized
 from ballfg.estimation.online.windows.stream_window import COEFFICIENT_THRESHOLD, Arrival, StreamWindow
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.prior import coefficient_prior
-
-WILDFIRE = 1e-7
-"""m, m/s, rad/s. Back-substitution stops where the solution changes by less."""
 
 
 class IsamWindow(StreamWindow):
@@ -27,23 +25,23 @@ class IsamWindow(StreamWindow):
 
     Attributes:
         isam: of GTSAM.
-        shared: factors without a sample: the prior of the coefficients and the linear factors of the removed states.
+        shared: factors without a sample, by their slots in iSAM2: the prior of the coefficients and the linear factors
+            of the removed states.
     """
 
     def _clear(self) -> None:
         """An empty iSAM2 and no states."""
         super()._clear()
         self.isam = self._new_isam()
-        self._shared_slots: list[int] = []  # of the shared factors in iSAM2
         if not self.first:
             prior = Bridge(coefficient_prior(self._own_means, self._own_sigmas), "row") if self.p else None
-            self.shared: list[gtsam.NonlinearFactor] = [] if prior is None else [prior.factor(0)]
+            self.shared: dict[int, gtsam.NonlinearFactor] = {} if prior is None else {0: prior.factor(0)}
 
     def _first_is_known(self) -> bool:
-        return any(STATE_KEY + self.first in list(factor.keys()) for factor in self.shared)
+        return any(STATE_KEY + self.first in list(factor.keys()) for factor in self.shared.values())
 
     def _new_isam(self) -> gtsam.ISAM2:
-        return gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
+        return gtsam.ISAM2(parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
 
     def _insert(self, arrivals: Sequence[Arrival]) -> int:
         """Adds new states with their factors to iSAM2, and reads back the solution."""
@@ -62,13 +60,13 @@ class IsamWindow(StreamWindow):
                 self.intervals.append(arrival.interval)
             self.samples.append(sample)
         if not older:
-            for factor in self.shared:
+            for factor in self.shared.values():
                 graph.push_back(factor)
             if self.p:
                 values.insert(COEFFICIENT_KEY, self.coefficient_theta)
         slots = self._update(graph, values, [], last if self.p and older else {}, self._fixed_keys())
         if not older:
-            self._shared_slots = slots[len(slots) - len(self.shared) :]
+            self.shared = dict(zip(slots[len(slots) - len(self.shared) :], self.shared.values(), strict=True))
         begin = 0
         for arrival, end in zip(arrivals, ends, strict=True):
             linked = self.biased and (older or begin > 0)
@@ -126,7 +124,7 @@ class IsamWindow(StreamWindow):
                 groups.insert2(key, group)
             how.constrainedKeys = groups
         if held:
-            how.noRelinKeys = _key_list(held)
+            how.noRelinKeys = key_list(held)
         self._result = self.isam.update(graph, values, how)
         return list(self._result.getNewFactorsIndices())
 
@@ -161,7 +159,7 @@ class IsamWindow(StreamWindow):
         other.isam = gtsam.ISAM2(self.isam)
         other.samples = list(samples)
         other.intervals = [copy.copy(interval) for interval in self.intervals]
-        other.shared = list(self.shared)
+        other.shared = dict(self.shared)
         other.coefficient_delta = self.coefficient_delta.copy()  # GTSAM's own memory, which its next update overwrites
         return other
 
@@ -213,18 +211,13 @@ class IsamWindow(StreamWindow):
             self._restart_bias(leaving)
         made, removed = self._take_off(leaving)
         point, held = self._point(leaving + 1), self.isam.getFactorsUnsafe()
-        known = [(slot, factor) for slot, factor in self._known() if slot not in removed]
-        known += [(slot, linear_factor(*linearized(held.at(slot), point), point)) for slot in made]
-        self.shared, self._shared_slots = [f for _, f in known], [slot for slot, _ in known]
+        self.shared = {slot: factor for slot, factor in self.shared.items() if slot not in removed}
+        self.shared |= {slot: linear_factor(*linearized(held.at(slot), point), point) for slot in made}
         self.first += leaving
         self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
         self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
         self.samples[0].bias_slot = None
         self._merge_shared()
-
-    def _known(self) -> list[tuple[int, gtsam.NonlinearFactor]]:
-        """The shared factors with their slots."""
-        return list(zip(self._shared_slots, self.shared, strict=True))
 
     def _take_off(self, leaving: int) -> tuple[list[int], set[int]]:
         """Removes the oldest states from iSAM2; slots of the linear factors in their place, and of all removed ones.
@@ -232,7 +225,7 @@ class IsamWindow(StreamWindow):
         Raises: RuntimeError: from GTSAM, when the removed part is singular.
         """
         keys, n, whole = self._keys(), len(self.samples), gtsam.ISAM2(self.isam)
-        leaves = _key_list(keys[:leaving])
+        leaves = key_list(keys[:leaving])
         staying = self._slots(range(leaving, n), range(leaving, n - 1), range(leaving + 1, n))
         try:
             made, removed = self.isam.marginalizeLeavesWithIndices(leaves)
@@ -240,29 +233,24 @@ class IsamWindow(StreamWindow):
         except (RuntimeError, ValueError):
             below = True
         if below:  # states that stay were eliminated before leaving ones, and GTSAM dropped them as well
-            self.isam = gtsam.ISAM2(whole)
-            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), _eliminating_last(keys[leaving:], keys))
+            self.isam = whole
+            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), eliminating_last(keys[leaving:], keys))
             made, removed = self.isam.marginalizeLeavesWithIndices(leaves)
         return made, set(removed)
 
     def _merge_shared(self) -> None:
         """Keeps what is known of the coefficients alone in one factor, however often the window is cut."""
-        alone = [(slot, factor) for slot, factor in self._known() if list(factor.keys()) == [COEFFICIENT_KEY]]
+        alone = {slot: factor for slot, factor in self.shared.items() if list(factor.keys()) == [COEFFICIENT_KEY]}
         if len(alone) < 2:
             return
-        stacked, point = gtsam.GaussianFactorGraph(), self._point(0)
-        for _, factor in alone:
+        stacked, point, graph = gtsam.GaussianFactorGraph(), self._point(0), gtsam.NonlinearFactorGraph()
+        for factor in alone.values():
             stacked.push_back(factor.linearize(point))
         triangle = np.linalg.qr(stacked.augmentedJacobian(), mode="r")[: self.p]
-        merged, graph = (
-            linear_factor([COEFFICIENT_KEY], [triangle[:, :-1]], triangle[:, -1], point),
-            gtsam.NonlinearFactorGraph(),
-        )
+        merged = linear_factor([COEFFICIENT_KEY], [triangle[:, :-1]], triangle[:, -1], point)
         graph.push_back(merged)
-        slots = [slot for slot, _ in alone]
-        rest = [(slot, factor) for slot, factor in self._known() if slot not in slots]
-        rest += zip(self._update(graph, gtsam.Values(), slots, {}, self._keys()), [merged], strict=True)
-        self.shared, self._shared_slots = [f for _, f in rest], [slot for slot, _ in rest]
+        (slot,) = self._update(graph, gtsam.Values(), list(alone), {}, self._keys())
+        self.shared = {s: factor for s, factor in self.shared.items() if s not in alone} | {slot: merged}
 
     def _restart_bias(self, k: int) -> None:
         """Replaces the link of a state's bias to the one before by the prior of a bias."""
@@ -270,6 +258,7 @@ class IsamWindow(StreamWindow):
         graph.push_back(bias_start(STATE_KEY + self.first + k, self.settings))
         slots = self._update(graph, gtsam.Values(), [sample.bias_slot], {}, self._keys())
         sample.slots, sample.bias_slot = (*sample.slots, *slots), None
+        self._read_back()
 
     def joint_covariances(self, count: int) -> list[Array]:
         """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
@@ -279,7 +268,7 @@ class IsamWindow(StreamWindow):
     def summaries(self) -> list[FactorBatch]:
         """The linear factors from removed states, about the present estimate."""
         values = self.values if self.first else None
-        return [] if values is None else [LinearFactors.of_gtsam(f, values, self.first) for f in self.shared]
+        return [] if values is None else [LinearFactors.of_gtsam(f, values, self.first) for f in self.shared.values()]
 
     def _point(self, count: int) -> gtsam.Values:
         """The linearisation points of the first states of the window and of the coefficients."""
@@ -295,38 +284,3 @@ class IsamWindow(StreamWindow):
         slots = [slot for k in samples for slot in self.samples[k].slots]
         slots += [i.slot for k in intervals if (i := self.intervals[k]) is not None and i.slot is not None]
         return slots + [slot for k in biases if (slot := self.samples[k].bias_slot) is not None]
-
-
-def _eliminating_last(last: Sequence[int], every: Sequence[int]) -> gtsam.ISAM2UpdateParams:
-    """An update of iSAM2 that moves no point and eliminates all variables anew, some of them last."""
-    how, groups = gtsam.ISAM2UpdateParams(), gtsam.KeyGroupMap()
-    how.extraReelimKeys = how.noRelinKeys = _key_list(every)
-    for key in last:
-        groups.insert2(key, 2 if key == COEFFICIENT_KEY else 1)
-    how.constrainedKeys = groups
-    return how
-
-
-def _key_list(keys: Iterable[int]) -> gtsam.KeyList:
-    """Keys as GTSAM takes them."""
-    found = gtsam.KeyList()
-    for key in keys:
-        found.push_back(key)
-    return found
-
-
-def _parameters(threshold: Array, coefficient_threshold: Array) -> gtsam.ISAM2Params:
-    """QR, because a loose spin prior beside a tight process noise defeats Cholesky."""
-    parameters = gtsam.ISAM2Params()
-    parameters.setFactorization("QR")
-    parameters.relinearizeSkip = 1
-    parameters.findUnusedFactorSlots = True
-    thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", threshold))
-    if len(coefficient_threshold):
-        thresholds.insert(("c", coefficient_threshold))
-    parameters.setRelinearizeThreshold(thresholds)
-    solver = gtsam.ISAM2GaussNewtonParams()
-    solver.setWildfireThreshold(WILDFIRE)
-    parameters.setOptimizationParams(solver)
-    return parameters
