@@ -32,6 +32,7 @@ STREAM_NOISE: Final = 0.003  # m, as the simulation has it
 PAUSE: Final = 1.5  # s between two flights of a stream
 STEPS: Final = 300  # Number of steps of 10 ms in a rollout
 SLOWEST: Final = 3  # Runs of what takes seconds
+BUDGET: Final = 4.0  # ms, of a push
 
 
 def time_bounces(watch: Stopwatch, name: str, model: BallModel, noise: float, label_noise: float) -> None:
@@ -57,14 +58,14 @@ def time_growth(watch: Stopwatch, name: str, model: BallModel, start: Sequence[f
         watch.add(name, f"estimate_us_per_observation_{count}", 1e3 * spent.value / count, watch.runs)
 
 
-def time_stream(watch: Stopwatch, solver: Solver, flights: int) -> None:
+def time_stream(watch: Stopwatch, solver: Solver, flights: int, budget_ms: float | None = None) -> None:
     """Every push of a stream of simulated flights, with the state that it returns, after `Online.warm_up`."""
     shots = [shot.track for shot in simulate(SimulationConfig(tracks=flights, rate=STREAM_RATE, seed=5))]
     nominal, table = nominal_model(RADIUS), SimulationConfig().ball.surfaces
     learned = build(Architecture.of("mnn+gs", residual=True), radius=RADIUS, base=nominal).requires_grad_(False)
     for name, model in (("mnn+gs", learned), ("nominal", nominal)):
         settings = Settings.for_measured(model, position_noise=(STREAM_NOISE,) * 3, solver=solver)
-        online = Online(model, table, settings)
+        online = Online(model, table, settings, budget_ms=budget_ms)
         online.warm_up()
         spent, begin = [], 0.0
         for shot in shots:
@@ -72,6 +73,7 @@ def time_stream(watch: Stopwatch, solver: Solver, flights: int) -> None:
                 spent.append(milliseconds(partial(online.push, begin + time, position)))
             begin += shot.times[-1] + PAUSE
         row, count = f"{name}, {solver}", len(spent)
+        row += "" if budget_ms is None else f", budget {budget_ms:g} ms"
         watch.results.add(watch.case, row, "stream_push_median", "ms", median_and_quartiles(spent), count)
         for share, metric in ((0.99, "stream_push_p99"), (0.999, "stream_push_p999"), (1.0, "stream_push_worst")):
             watch.results.add(watch.case, row, metric, "ms", float(np.quantile(spent, share)), count)

@@ -117,6 +117,7 @@ def run_speed(results: Results, dataset: Dataset | None, size: Size) -> None:
         partial(_time_gradients, watch, model, track, size.pretrain_iterations),
         partial(robot.time_growth, watch, "analytic", model, START, NOISE),
         *(partial(robot.time_stream, watch, solver, size.flights) for solver in ONLINE),
+        partial(robot.time_stream, watch, "gtsam", size.flights, robot.BUDGET),
         partial(robot.time_events, watch),
         partial(robot.time_rollouts, watch),
     ]

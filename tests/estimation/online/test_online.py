@@ -234,3 +234,44 @@ def test_a_warm_up_leaves_the_stream_alone() -> None:
         expected, given = cold.push(time, position), warm.push(time, position)
         np.testing.assert_array_equal(given.mean, expected.mean)
         np.testing.assert_array_equal(given.joint, expected.joint)
+
+
+def test_a_budget_limits_how_many_states_a_push_moves():
+    """Both solvers move the same states; a generous budget changes nothing; positions stay as good as they were."""
+    track, truth = make_track(BOUNCING, n=120, dt=0.005)
+    model, states, reach = nominal_model(), {}, 6
+    for name, solver, budget in (("free", "ballfg", None), ("ballfg", "ballfg", 1e-3), ("gtsam", "gtsam", 1e-3)):
+        online = Online(model, TABLE, settings(solver=solver), budget_ms=budget)
+        online.reach = None if budget is None else reach
+        states[name] = feed(online, track)
+    most = max(state.evaluated for state in states["free"] if not state.revised)
+    assert most > 3 * reach
+    assert max(state.evaluated for state in states["ballfg"] if not state.revised) <= reach + 2
+    for one, other in zip(states["ballfg"], states["gtsam"], strict=True):
+        assert np.abs((one.mean - other.mean) / np.sqrt(np.diag(one.joint))).max() < 1e-6
+    off = {
+        name: np.linalg.norm([s.state[:3] - x[:3] for s, x in zip(found, truth, strict=True)])
+        for name, found in states.items()
+    }
+    assert off["ballfg"] < 1.05 * off["free"]
+
+
+def test_a_budget_is_measured_on_the_machine():
+    """A budget that no push meets is said, and the points of all but the newest state stay; a long one moves all."""
+    track, _ = make_track(FLYING, n=30, surfaces=NOWHERE)
+    chosen = settings(solver="ballfg")
+    short = Online(nominal_model(), NOWHERE, chosen, budget_ms=1e-4)
+    with pytest.warns(UserWarning, match="budget_ms is 0.0001, but on this machine a push"):
+        short.warm_up()
+    assert short.reach == 1
+    long = Online(nominal_model(), NOWHERE, chosen, budget_ms=1e4)
+    found, expected = feed(long, track), feed(Online(nominal_model(), NOWHERE, chosen), track)
+    assert long.reach is not None
+    assert long.reach > 1000
+    np.testing.assert_array_equal([s.mean for s in found], [s.mean for s in expected])
+
+
+@pytest.mark.parametrize("budget", [0.0, -1.0, np.nan])
+def test_a_budget_is_a_positive_time(budget):
+    with pytest.raises(ValueError, match="budget_ms must be positive"):
+        Online(nominal_model(), TABLE, settings(), budget_ms=budget)

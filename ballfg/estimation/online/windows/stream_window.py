@@ -55,6 +55,7 @@ class StreamWindow(ABC):
         model: the ball, from `problem.trackwise_model`.  settings: noise and priors.
         position_sigma: m, of a good measurement; scales the threshold of relinearisation in position.
         biased: True if the tracker's bias, a vector of three, follows each state.
+        reach: number of the newest states that an update may linearise anew; None: all.
 
     Attributes:
         first: number of the window's first state since the stream began.
@@ -64,11 +65,19 @@ class StreamWindow(ABC):
         newest_covariance: (w + p, w + p) of the newest state with its bias and the coefficients.
     """
 
-    def __init__(self, model: BallModel, settings: Settings, position_sigma: float, biased: bool = False) -> None:
+    def __init__(
+        self,
+        model: BallModel,
+        settings: Settings,
+        position_sigma: float,
+        biased: bool = False,
+        reach: int | None = None,
+    ) -> None:
         self.model = model
         self.settings = settings
         self.position_sigma = position_sigma
         self.biased = biased
+        self.reach = reach
         self.width = STATE_DIM + BIAS_DIM * biased
         self.maker = IntervalMaker(model, settings.process)
         self.p = model_width(model)
@@ -235,6 +244,12 @@ class StreamWindow(ABC):
         _, count, calls = self._relinearize(None)
         return Update(np.full(3, np.nan), count, calls, self._insert([Arrival(sample, state, None, priors)]))
 
+    @property
+    def _settled(self) -> int:
+        """Number of the oldest states whose points stay: those out of reach, and one that removed states tell of."""
+        out_of_reach = 0 if self.reach is None else max(len(self.theta) - self.reach, 0)
+        return max(out_of_reach, int(self.first > 0 and self._first_is_known()))
+
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
         """Moves states whose solution left the thresholds, and evaluates their factors, ahead of iSAM2.
 
@@ -245,9 +260,8 @@ class StreamWindow(ABC):
         """
         moved = np.asarray((np.abs(self.delta) > self.threshold).any(axis=1), dtype=bool)
         limit = COEFFICIENT_THRESHOLD * self._own_sigmas
-        shared = bool((np.abs(self.coefficient_delta) > limit).any()) and not self.first
-        if self.first and len(moved):
-            moved[0] &= not self._first_is_known()
+        moved[: self._settled] = False
+        shared = not self.first and not self._settled and bool((np.abs(self.coefficient_delta) > limit).any())
         touched, begins = list[Interval](), list[int]()
         if moved.any():
             self.theta = np.where(moved[:, None], self.theta + self.delta, self.theta)

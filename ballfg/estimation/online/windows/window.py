@@ -129,9 +129,10 @@ class IsamWindow(StreamWindow):
         return list(self._result.getNewFactorsIndices())
 
     def _fixed_keys(self) -> list[int]:
-        """GTSAM's keys of the variables whose linearisation points a linear factor of removed states fixes."""
-        keys = [STATE_KEY + self.first] * self._first_is_known() + [COEFFICIENT_KEY] * (self.p > 0)
-        return keys if self.first else []
+        """GTSAM's keys of the variables whose points stay, whatever the thresholds say."""
+        first, settled = STATE_KEY + self.first, self._settled
+        shared = self.p > 0 and (self.first > 0 or settled > 0)
+        return [*range(first, first + settled), *[COEFFICIENT_KEY] * shared]
 
     def _keys(self) -> list[int]:
         """GTSAM's keys of all variables."""
