@@ -90,6 +90,8 @@ class ShownShot:
     predicted_times: Array = field(default_factory=lambda: np.zeros(0))  # (k,) s
     predicted: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k, 3) m
     predicted_sigmas: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k, 3) m, of a measured position
+    flights: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(k,) number of the flight that each prediction is of; empty: all are of one."""
     marks: tuple[Mark, ...] = ()  # contacts and hits in the states
     labels: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
     """(m,) what the ball does at each state; empty if unknown."""
@@ -139,6 +141,15 @@ class ShownShot:
         """(k, 3) m, measured less predicted; NaN without a measurement."""
         return _at(self.predicted_times, self.times, self.positions) - self.predicted
 
+    def horizons(self) -> Array:
+        """(k,) s from the last observed sample of each prediction's flight; NaN where none is before it."""
+        found, flights = np.full(len(self.predicted_times), np.nan), self.flights
+        for flight in np.unique(flights).tolist() or [0]:
+            own = flights == flight if len(flights) else np.full(len(found), True)
+            if own.any() and len(before := self.times[self.times < self.predicted_times[own].min()]):
+                found[own] = self.predicted_times[own] - before[-1]
+        return found
+
 
 def covariances(sigmas: Array, correlations: Array | None = None) -> Array:
     """(k, 3, 3) m^2 of standard deviations (k, 3) m and correlations (k, 3) of x and y, x and z, y and z.
@@ -175,7 +186,7 @@ BIN = 0.05  # s, width of the bins of the horizon
 
 @dataclass(frozen=True)
 class Coverage:
-    """Shares by horizon, the time since the last sample before the first predicted one."""
+    """Shares by horizon, the time since the last sample before the first predicted one of a flight."""
 
     horizons: Array  # (b,) s, the middle of each bin that holds samples
     shares: Array  # (b, 3) of the coordinates x, y, z inside their intervals, 0 to 1
@@ -192,13 +203,10 @@ def coverage(shots: Iterable[ShownShot]) -> Coverage:
     samples: dict[int, int] = {}
     tracks: dict[int, int] = {}
     for shot in shots:
-        errors = np.abs(shot.prediction_errors())
-        known = np.isfinite(errors).all(axis=1)
-        before = shot.times[shot.times < shot.predicted_times[0]] if len(shot.predicted_times) else shot.times
-        if not known.any() or not len(before):
-            continue
+        errors, ahead = np.abs(shot.prediction_errors()), shot.horizons()
+        known = np.isfinite(errors).all(axis=1) & np.isfinite(ahead)
         inside = errors[known] <= HALF_WIDTH * shot.predicted_sigmas[known]
-        bins = np.floor((shot.predicted_times[known] - before[-1] + SAME_STAMP) / BIN).astype(int)
+        bins = np.floor((ahead[known] + SAME_STAMP) / BIN).astype(int)
         for b in np.unique(bins).tolist():
             held[b] = held.get(b, np.zeros(3)) + inside[bins == b].sum(axis=0)
             samples[b] = samples.get(b, 0) + int((bins == b).sum())

@@ -131,6 +131,7 @@ def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
     if given.predictions is not None:
         rows = _rows(given.predictions, name, track)
         shot = replace(shot, predicted_times=rows[:, 0], predicted=rows[:, 1:4], predicted_sigmas=rows[:, 4:])
+        shot = replace(shot, flights=given.predictions.flights[given.predictions.rows.get(name, slice(0))])
     return shot.on_rays
 
 

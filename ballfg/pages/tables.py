@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.checks import NAME_RULE, is_name, one_line, shown
 from ballfg.files.parquet import open_parquet
 from ballfg.files.spreadsheet import bare
@@ -41,6 +41,7 @@ class ResultTable:
     values: Array  # (rows, 1 + c) t in s and the columns of the kind, sorted by track and time
     labels: NDArray[np.str_]  # (rows,) what the ball does at each state; empty without the column `label`
     correlations: Array  # (rows, 3) of x and y, x and z, y and z of states; 0 where the table has none
+    flights: Index  # (rows,) number of the trajectory in the table that each row is of
 
     def of(self, name: str) -> Array:
         """(k, 1 + c) rows of a track in the units of the columns; empty for an unknown track."""
@@ -57,7 +58,7 @@ class ResultTable:
         ends = np.cumsum([0, *(sum(map(len, found)) for found in parts.values())]).tolist()
         rows_of = {name: slice(*pair) for name, pair in zip(parts, pairwise(ends), strict=True)}
         labels = self.labels[order] if len(self.labels) else self.labels
-        ordered = (self.values[order], labels, self.correlations[order])
+        ordered = (self.values[order], labels, self.correlations[order], self.flights[order])
         return ResultTable(self.path, self.kind, rows_of, *ordered)
 
 
@@ -123,7 +124,7 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     ends = np.cumsum(np.bincount(codes, minlength=len(tracks))).tolist()
     rows = map(slice, [0, *ends], ends)
     labels = np.array(found[LABEL].to_pylist() if labelled else [], dtype=np.str_)
-    ordered = (values[order, :end], labels[order[: len(labels)]], correlations[order])
+    ordered = (values[order, :end], labels[order[: len(labels)]], correlations[order], codes[order])
     return ResultTable(path, kind, dict(zip(tracks, rows, strict=True)), *ordered)
 
 

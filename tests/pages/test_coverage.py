@@ -1,5 +1,7 @@
 """The share of samples inside their intervals, against loops and against the normal distribution."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,19 @@ def test_bins_are_counted_from_the_last_observed_sample() -> None:
     np.testing.assert_allclose(found.horizons, [(b + 0.5) * BIN for b in inside])
     np.testing.assert_allclose(found.shares[:, 1], [np.mean(row) for row in inside.values()])
     assert (found.shots == 1).all()
+
+
+def test_horizons_of_a_recording_count_from_what_each_flight_observed() -> None:
+    """Two flights of one recording, the second predicted from 1.2 s on after 0.2 s that were observed."""
+    (shot,) = shots(1, 0.02)
+    twice = np.concatenate((shot.times, 1.0 + shot.times))
+    ahead = np.concatenate((shot.predicted_times, 1.0 + shot.predicted_times))
+    doubled = {name: np.tile(getattr(shot, name), (2, 1)) for name in ("positions", "predicted", "predicted_sigmas")}
+    both = replace(shot, times=twice, predicted_times=ahead, flights=np.repeat([4, 7], len(shot.predicted)), **doubled)
+    one, two = coverage([shot]), coverage([both])
+    np.testing.assert_allclose(two.horizons, one.horizons)
+    np.testing.assert_allclose(two.shares, one.shares)
+    np.testing.assert_array_equal(two.samples, 2 * one.samples)
 
 
 def test_infinite_intervals_hold_everything_and_no_prediction_gives_no_bins() -> None:

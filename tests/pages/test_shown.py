@@ -43,6 +43,9 @@ def test_predictions_of_flights_are_shown_with_their_recording(made: Made, tmp_p
         assert shot.name == same.name
         np.testing.assert_array_equal(shot.predicted, same.predicted)
         np.testing.assert_array_equal(shot.predicted_times, same.predicted_times)
+        cut = int((shot.predicted_times <= np.median(times)).sum())
+        begins = np.repeat([shot.times[25], shot.predicted_times[cut - 1]], [cut, len(shot.predicted_times) - cut])
+        np.testing.assert_allclose(same.horizons(), same.predicted_times - begins)
 
 
 def test_noise_of_the_residuals_where_none_is_stated(tmp_path: Path) -> None:
