@@ -134,8 +134,10 @@ class ShownShot:
         return replace(self, positions=positions, noise=noise)
 
     def residuals(self) -> Array:
-        """(n, 3) m, measured less estimated; NaN at samples without a state."""
-        return self.positions - _at(self.times, self.state_times, self.states[:, :3])
+        """(n, 3) m, measured less estimated; NaN without a state, and where the state is the measured position."""
+        found = self.positions - _at(self.times, self.state_times, self.states[:, :3])
+        found[(found == 0.0).all(axis=1)] = np.nan  # of a held ball, for instance: nothing was estimated there
+        return found
 
     def prediction_errors(self) -> Array:
         """(k, 3) m, measured less predicted; NaN without a measurement."""

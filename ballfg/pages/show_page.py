@@ -127,7 +127,7 @@ def _residuals(shown: Shown) -> Html:
             f"samples, belong between the dashed lines. Those beyond {LARGEST:g} are drawn there, with open signs."
         )
         figures.append(_figure("whitened", "In standard deviations", words, "plot"))
-    words_ = tag("p", "The ", explained("residuals", meaning), " of the estimate at each sample. ", shown.noise)
+    words_ = tag("p", "The ", explained("residuals", meaning), " where the estimate moves a sample. ", shown.noise)
     return section("Residuals: measured less estimated", words_, tag("div", *figures, kind="plots"))
 
 

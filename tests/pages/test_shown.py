@@ -14,7 +14,7 @@ from ballfg.pages import shown as room
 from ballfg.pages.given import recognise
 from ballfg.pages.show_page import _shot
 from ballfg.pages.shown import collect
-from tests.pages.made import NOISE, Fall, Made, make
+from tests.pages.made import NOISE, Fall, Made, make, write
 
 
 def test_residuals_are_measured_less_estimated(made: Made) -> None:
@@ -53,6 +53,21 @@ def test_noise_of_the_residuals_where_none_is_stated(tmp_path: Path) -> None:
     shown = collect(recognise([made.dataset, made.states]))
     assert shown.shots[0].noise == pytest.approx(NOISE, rel=0.1)  # 1800 samples: 3 % of chance
     assert "states no noise" in shown.noise
+
+
+def test_samples_that_the_estimate_leaves_as_measured_have_no_residual(tmp_path: Path) -> None:
+    """60 % of the ball's samples are held: counted, their zeros would leave a noise of none."""
+    made = make(tmp_path, {str(i): Fall(samples=100) for i in range(15)}, noise=False)
+    head, *states = (line.split(",") for line in made.states.read_text().splitlines())
+    _, *measured = (line.split(",") for line in (made.dataset / "tracks.csv").read_text().splitlines())
+    for state, seen in zip(states, measured, strict=True):
+        if float(state[1]) < 0.595:
+            state[2:5] = seen[2:]
+    write(made.states, head, states)
+    for shot in collect(recognise([made.dataset, made.states])).shots:
+        assert np.isnan(shot.residuals()[:60]).all()
+        assert np.isfinite(shot.residuals()[60:]).all()
+        assert shot.noise == pytest.approx(NOISE, rel=0.15)  # 600 samples: 5 % of chance
 
 
 @pytest.mark.parametrize(
