@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ballfg.arrays import Array
 from ballfg.pages.outline import Outline
-from ballfg.pages.shot import HALF_WIDTH, ShownShot
+from ballfg.pages.shot import HALF_WIDTH, ShownShot, unbroken
 
 AXES: Final = ("x", "y", "z")
 COLOURS: Final = {"estimate": "#0072b2", "prediction": "#d55e00"}
@@ -96,8 +96,11 @@ def _bands(places: Array, covariances: Array) -> Array:
 
     Args: places: (m, 2) m.  covariances: (m, 2, 2) m^2.
     """
-    if len(places) < 2:
-        return np.zeros((0, 4, 2))
+    return np.concatenate([np.zeros((0, 4, 2)), *(_band(places[run], covariances[run]) for run in unbroken(places))])
+
+
+def _band(places: Array, covariances: Array) -> Array:
+    """`_bands` of a path without a break."""
     along = np.gradient(places, axis=0)
     length = np.linalg.norm(along, axis=1, keepdims=True)
     across = np.stack((-along[:, 1], along[:, 0]), axis=1) / np.where(length > 0.0, length, 1.0)

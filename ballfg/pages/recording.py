@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ballfg.pages.shot import ShownShot
+from ballfg.pages.shot import ShownShot, unbroken
 from ballfg.pages.shown import Shown
 
 RADIUS = 0.02  # m, of the moving ball, as large as a table-tennis ball
@@ -48,8 +48,8 @@ def _shot(rerun: Any, recording: Any, shot: ShownShot) -> None:
     if len(shot.times):
         recording.log(f"{name}/measured", rerun.Points3D(shot.positions, radii=0.004), static=True)
     for what, _, places, _ in shot.lines:
-        if len(places) > 1:
-            recording.log(f"{name}/{what}", rerun.LineStrips3D([places]), static=True)
+        if runs := unbroken(places):
+            recording.log(f"{name}/{what}", rerun.LineStrips3D([places[run] for run in runs]), static=True)
     for time, state in zip(shot.state_times, shot.states, strict=True):
         recording.set_time("time in the shot", duration=float(time) - start)
         recording.log(f"{name}/ball", rerun.Points3D([state[:3]], radii=RADIUS))

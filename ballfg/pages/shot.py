@@ -90,14 +90,14 @@ class ShownShot:
     predicted_times: Array = field(default_factory=lambda: np.zeros(0))  # (k,) s
     predicted: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k, 3) m
     predicted_sigmas: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (k, 3) m, of a measured position
-    flights: Index = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(k,) number of the flight that each prediction is of; empty: all are of one."""
     marks: tuple[Mark, ...] = ()  # contacts and hits in the states
     labels: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
     """(m,) what the ball does at each state; empty if unknown."""
     correlations: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """(m, 3) of the states' x and y, x and z, y and z; empty if unknown: then they are taken as 0."""
     sight: Sight | None = None  # how cameras saw the ball; None for measured positions
+    flights: Index = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(k,) number of the flight that each prediction is of; empty: all are of one."""
 
     @property
     def flying(self) -> list[bool] | None:
@@ -116,13 +116,29 @@ class ShownShot:
 
     @property
     def lines(self) -> list[tuple[str, Array, Array, Array]]:
-        """Name, stamps (k,) s, places (k, 3) m and covariances (k, 3, 3) m^2 of the estimate and of the prediction."""
+        """Name, stamps (k,) s, places (k, 3) m and covariances (k, 3, 3) m^2 of the estimate and of the prediction.
+
+        Where the ball does not fly, and in one more row in each step of more than `gap`, they are NaN: not drawn.
+        """
         estimated = covariances(self.state_sigmas[:, :3], self.correlations)
         predicted = covariances(self.predicted_sigmas)
+        flies = np.full(len(self.states), True) if self.flying is None else np.array(self.flying)
+        places = np.where(flies[:, None], self.states[:, :3], np.nan)
         return [
-            ("estimate", self.state_times, self.states[:, :3], estimated),
-            ("prediction", self.predicted_times, self.predicted, predicted),
+            ("estimate", *self._broken(self.state_times, places, estimated)),
+            ("prediction", *self._broken(self.predicted_times, self.predicted, predicted)),
         ]
+
+    @property
+    def gap(self) -> float:
+        """In s; paths are not drawn over longer steps: `GAP`, or more where most steps are long."""
+        steps = [np.diff(times) for times in (self.times, self.state_times, self.predicted_times)]
+        return max(GAP, *(2.0 * float(np.median(one)) for one in steps if len(one)), 0.0)
+
+    def _broken(self, times: Array, places: Array, spread: Array) -> tuple[Array, Array, Array]:
+        after = np.flatnonzero(np.diff(times) > self.gap) + 1
+        cut, wide = (np.insert(rows, after, np.nan, axis=0) for rows in (places, spread))
+        return np.insert(times, after, np.nan), cut, wide
 
     @property
     def on_rays(self) -> "ShownShot":
@@ -151,6 +167,13 @@ class ShownShot:
             if own.any() and len(before := self.times[self.times < self.predicted_times[own].min()]):
                 found[own] = self.predicted_times[own] - before[-1]
         return found
+
+
+def unbroken(places: Array) -> list[slice]:
+    """The runs of two or more known rows of a path (n, 3) m or (n, 2) m between rows of NaN."""
+    known = np.isfinite(places).all(axis=1)
+    ends = np.flatnonzero(np.diff(known, prepend=False, append=False)).reshape(-1, 2).tolist()
+    return [slice(first, end) for first, end in ends if end - first > 1]
 
 
 def covariances(sigmas: Array, correlations: Array | None = None) -> Array:

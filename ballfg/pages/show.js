@@ -91,7 +91,7 @@ function tube(times, places, sigmas, correlations, scale, style) {
       const c = Math.cos(2 * Math.PI * k / RING), s = Math.sin(2 * Math.PI * k / RING);
       const at = [0, 1, 2].map(a => places[a][row] + scale * BAND * (c * wide * side[a] + (c * both + s * high) * up[a]));
       x.push(at[0]); y.push(at[1]); z.push(at[2]);
-      if (number === 0 || times[row] - times[rows[number - 1]] > page.gap) continue;
+      if (number === 0 || times[row] - times[rows[number - 1]] > shot.gap) continue;
       const a = RING * number + k, b = RING * number + (k + 1) % RING;
       faces[0].push(a, b); faces[1].push(b, b - RING); faces[2].push(a - RING, a - RING);
     }
@@ -146,7 +146,7 @@ function cloud(places, times, words, style) {
 
 // A line that is not drawn where samples are missing: between its ends there nothing is known.
 function broken(trace, times) {
-  const gaps = times.map((t, i) => i > 0 && t - times[i - 1] > page.gap);
+  const gaps = times.map((t, i) => i > 0 && t - times[i - 1] > shot.gap);
   const cut = (values, filler) => values.flatMap((value, i) => gaps[i] ? [filler, value] : [value]);
   const result = {...trace, connectgaps: false};
   for (const key of ["x", "y", "z", "text"]) {
@@ -269,13 +269,22 @@ function line(x, y, extra) {
   return {type: "scatter", x, y, ...extra};
 }
 
-// The band between low and high; rows without a standard deviation leave a gap.
+// The band between low and high; rows without a standard deviation, and steps longer than a gap, interrupt it.
 function band(times, middle, sigmas, tint, extra) {
-  const known = times.map((_, i) => i).filter(i => middle[i] !== null && sigmas[i] !== null);
-  const x = known.map(i => times[i]), high = known.map(i => middle[i] + BAND * sigmas[i]);
-  const low = known.map(i => middle[i] - BAND * sigmas[i]);
-  return {type: "scatter", mode: "lines", x: [...x, ...x.slice().reverse()], y: [...high, ...low.reverse()], fill: "toself",
-          fillcolor: tint + "33", line: {width: 0}, hoverinfo: "skip", showlegend: false, ...extra};
+  const x = [], y = [], runs = [[]];
+  times.forEach((t, i) => {
+    const known = middle[i] !== null && sigmas[i] !== null;
+    if (!known || (i > 0 && t - times[i - 1] > shot.gap)) runs.push([]);
+    if (known) runs.at(-1).push(i);
+  });
+  const add = (i, side) => { x.push(times[i]); y.push(middle[i] + side * BAND * sigmas[i]); };
+  for (const run of runs.filter(rows => rows.length)) {
+    run.forEach(i => add(i, 1));
+    run.slice().reverse().forEach(i => add(i, -1));
+    x.push(null); y.push(null);
+  }
+  return {type: "scatter", mode: "lines", x, y, fill: "toself", fillcolor: tint + "33", line: {width: 0}, hoverinfo: "skip",
+          showlegend: false, ...extra};
 }
 
 function stacked(titles, unit) {

@@ -8,7 +8,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.pages.html import Html, doubtful, explained, items, own, section, table, tag, whole_page
 from ballfg.pages.outline import NET_HEIGHT, Outline
-from ballfg.pages.shot import FLIGHT, GAP, HALF_WIDTH, LEVEL, ShownShot
+from ballfg.pages.shot import FLIGHT, HALF_WIDTH, LEVEL, ShownShot
 from ballfg.pages.shown import Shown
 from ballfg.pages.sight import near_picture
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -205,7 +205,6 @@ def _data(shown: Shown) -> dict[str, Any]:
         "half_width": HALF_WIDTH,
         "level": 100.0 * LEVEL,
         "largest": LARGEST,
-        "gap": GAP,
         "table": None if shown.table is None else _table(shown.table),
         "cameras": _cameras(shown),
         "shots": [_shot(shot) for shot in shown.shots],
@@ -267,6 +266,7 @@ def _shot(shot: ShownShot) -> dict[str, Any]:
     noise = _plain(shot.noise.T, SIGMA_DECIMALS) if known else []  # of each axis one number if all are equal
     return {
         "name": shot.name,
+        "gap": shot.gap,
         "t": _plain(shot.times - start, TIME_DECIMALS),
         "positions": _plain(shot.positions.T, LENGTH_DECIMALS),
         "noise": [row[0] if len(set(row)) == 1 else row for row in noise],

@@ -13,7 +13,7 @@ from ballfg.pages.given import recognise
 from ballfg.pages.show_page import show_page
 from ballfg.pages.shown import collect
 from tests.browser import needs_browser, opened
-from tests.pages.made import Fall, Made, make
+from tests.pages.made import Fall, Made, make, write
 
 pytestmark = needs_browser
 MEASURE = """
@@ -67,6 +67,31 @@ def test_everything_is_drawn(made: Made, report: Path, tmp_path: Path, width: in
     assert found["ball"] == -0.8
     for name in ("measured", "estimate", "prediction", "contact", "spin axis, 0.1 m for 100 rad/s"):
         assert name in str(found["legend"]).split("|")
+
+
+BANDS = """
+const frame = document.querySelector("iframe");
+frame.addEventListener("load", () => setTimeout(() => {
+  const traces = frame.contentDocument.getElementById("axes").data, bands = traces.filter(one => one.fill === "toself");
+  document.body.dataset.found = JSON.stringify(bands.map(one => one.x));
+}, 3000));
+"""
+
+
+def test_bands_end_at_gaps(tmp_path: Path) -> None:
+    made = make(tmp_path, {"a": Fall()})
+    for path in (made.dataset / "tracks.csv", made.states, made.predictions):
+        head, *rows = path.read_text().splitlines()
+        write(path, head.split(","), [r.split(",") for r in rows if not 0.345 < float(r.split(",")[1]) < 0.475])
+    page = show_page(collect(recognise([made.dataset, made.states, made.predictions])))
+    elements, _ = opened(page, 1200, BANDS, tmp_path)
+    (found,) = re.findall(r'<body data-found="([^"]*)"', elements)
+    bands = json.loads(html.unescape(found))
+    assert len(bands) == 6
+    for band in bands:
+        before, after = [t for t in band if t is not None and t < 0.4], [t for t in band if t is not None and t > 0.4]
+        assert band == [*before, None, *after, None]
+        assert (max(before), min(after)) == (0.34, 0.48)
 
 
 def test_a_hostile_name_runs_nothing_and_two_samples_are_drawn(tmp_path: Path) -> None:

@@ -45,6 +45,32 @@ def test_a_band_is_ninety_percent_wide_across_the_path(shown: Shown) -> None:
     np.testing.assert_allclose(width, 2 * LEVEL_90 * SPREAD, rtol=1e-6)
 
 
+def test_nothing_is_drawn_over_a_gap_or_where_the_ball_is_held(made: Made, shown: Shown) -> None:
+    """Of the prediction 0.35 .. 0.45 s is missing; the estimate leaves the first ten samples as measured."""
+    shot, n = shown.shots[0], len(shown.shots[0].states)
+    kept = (shot.predicted_times <= 0.345) | (shot.predicted_times > 0.455)
+    names = ("predicted_times", "predicted", "predicted_sigmas")
+    gapped = replace(shot, **{name: getattr(shot, name)[kept] for name in names})
+    gapped = replace(gapped, labels=np.array(["held"] * 10 + ["flight"] * (n - 10)))
+    for figure, bands in ((views(gapped), True), (by_axis(gapped), False)):
+        drawn = lines(figure, 0)
+        assert np.isnan(drawn["estimate"][:10, 1]).all()
+        assert np.isfinite(drawn["estimate"][10:]).all()
+        (row,) = np.flatnonzero(np.isnan(drawn["prediction"]).all(axis=1))
+        np.testing.assert_array_equal(np.delete(drawn["prediction"], row, 0)[:, 1], gapped.predicted[:, 2 * bands])
+        assert row == int((gapped.predicted_times < 0.4).sum())
+    steps = [len(c.get_paths()) for c in views(gapped).axes[0].collections if isinstance(c, PolyCollection)]
+    assert steps == [n - 10 - 1, kept.sum() - 2]
+
+
+def test_a_slow_recording_has_lines(shown: Shown) -> None:
+    shot = replace(shown.shots[0], times=20.0 * shown.shots[0].times, predicted_times=np.zeros(0))
+    shot = replace(
+        shot, state_times=20.0 * shot.state_times, predicted=np.zeros((0, 3)), predicted_sigmas=np.zeros((0, 3))
+    )
+    assert np.isfinite(lines(by_axis(shot), 0)["estimate"]).all()  # 5 Hz
+
+
 def test_a_flight_along_y_is_drawn_over_y(shown: Shown) -> None:
     shot = shown.shots[0]
     turned = replace(shot, **{name: getattr(shot, name)[:, [1, 0, 2]] for name in ("positions", "predicted")})
