@@ -17,14 +17,14 @@ from ballfg.estimation.result import Status
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.broadcast.candidates import BALLS, find_candidates
 from ballfg.vision.broadcast.court import Court
-from ballfg.vision.broadcast.doubled import without_doubled
+from ballfg.vision.broadcast.doubled import Kept, without_doubled
 from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
 from ballfg.vision.broadcast.resized import Scale
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.one_thread import one_thread
 
-OwnCandidates = Callable[[Shot, Array], Detections]
-"""Gives the candidates of a user's detector in the pictures of a shot, from the stamps (f,) s of all pictures."""
+OwnCandidates = Callable[[Shot, Array, Kept], Detections]
+"""Gives the candidates of a user's detector in the pictures of a shot, from the stamps (f,) s of the kept pictures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +85,16 @@ def track_moving_camera(
         frames: opens the video, each time anew.  count: of its pictures, about.  court: in them.  model: the ball.
         corners: number of a picture -> (4, 2) px of the court's corners, in any order; None: the court is found.
         candidates: of a detector of one's own; None: bright moving spots, as of a white ball, or else an orange one.
-    Raises: ValueError: no picture shows the court.
+    Raises: ValueError: no picture shows the court, or corners or candidates are of no picture.
     """
     kept = without_doubled(frames, count, watch)
     scale = Scale.of(_size(kept.frames))
     if corners is not None:
+        if strange := [picture for picture in corners if not 0 <= picture < len(kept.stamps)]:
+            raise ValueError(
+                f"--corners must be of pictures 0 to {len(kept.stamps) - 1} of the video; got picture {strange[0]}. "
+                "Correct the column frame."
+            )
         places = np.searchsorted(kept.numbers, list(corners), side="right") - 1
         fours = [scale.to_searched(four) for four in corners.values()]
         corners = {int(place): four for place, four in zip(places, fours, strict=True)}
@@ -103,7 +108,7 @@ def track_moving_camera(
             sought = (find_candidates(frames, shot, court, model.radius, motion.times, one, watch) for one in BALLS)
             share = SEEN
         else:
-            own = candidates(scale.shot_of_video(shot), motion.times)
+            own = candidates(scale.shot_of_video(shot), motion.times, kept)
             sought, share = (scale.detections_searched(one) for one in (own,)), UNKNOWN
         one = _first_with_strokes(
             reconstruct(found, shot, model, surfaces, first=len(rows), seen_share=share, watch=watch)

@@ -31,12 +31,22 @@ class Kept:
 
     Attributes:
         frames: opens the video without the others.  numbers: (f,) of the kept pictures in the video.
-        doubled: number of the others.
+        stamps: (n,) s, of all pictures, as the video has them.
     """
 
     frames: Frames
     numbers: Index
-    doubled: int
+    stamps: Array
+
+    @property
+    def doubled(self) -> int:
+        """Number of the others."""
+        return len(self.stamps) - len(self.numbers)
+
+    def places(self, pictures: Index) -> Index:
+        """(p,) places among the kept ones of pictures (p,) of the video; -1 for the others."""
+        after = np.clip(np.searchsorted(self.numbers, pictures), 0, len(self.numbers) - 1)
+        return np.where(self.numbers[after] == pictures, after, -1)
 
 
 def without_doubled(frames: Frames, count: int, watch: Watch = unwatched) -> Kept:
@@ -58,7 +68,7 @@ def without_doubled(frames: Frames, count: int, watch: Watch = unwatched) -> Kep
     repeats: Mask = np.append(False, np.array(changes) < least)
     numbers = np.flatnonzero(~repeats)
     if len(numbers) == len(times):
-        return Kept(frames, numbers, 0)
+        return Kept(frames, numbers, np.array(times))
     stamps = _even(np.array(times), repeats)[numbers]
 
     def kept() -> Iterator[tuple[float, Image]]:
@@ -67,7 +77,7 @@ def without_doubled(frames: Frames, count: int, watch: Watch = unwatched) -> Kep
             if not again:
                 yield next(place), image
 
-    return Kept(kept, numbers, int(repeats.sum()))
+    return Kept(kept, numbers, np.array(times))
 
 
 def _even(times: Array, repeats: Mask) -> Array:

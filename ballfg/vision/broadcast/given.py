@@ -9,6 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.tracks import csv_files, detections_file
+from ballfg.vision.broadcast.doubled import Kept
 from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.detection.detections import Detections
 
@@ -35,6 +36,10 @@ def read_corners(path: Path) -> dict[int, Array]:
         row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
         if not all(csv_files.is_number(row.get(name, "")) for name in ("frame", "u", "v")):
             raise ValueError(f"{path}, line {line}: frame, u and v must be numbers. Correct it.")
+        if float(row["frame"]) % 1.0 != 0.0:
+            raise ValueError(
+                f"{path}, line {line}: frame must be a picture's number, from 0 on; got {row['frame']}. Correct it."
+            )
         found.setdefault(int(float(row["frame"])), []).append((float(row["u"]), float(row["v"])))
     for frame, points in found.items():
         if len(points) != CORNERS:
@@ -42,26 +47,36 @@ def read_corners(path: Path) -> dict[int, Array]:
     return {frame: np.array(points) for frame, points in found.items()}
 
 
-def read_candidates(path: Path, shot: Shot, stamps: Array) -> Detections:
+def read_candidates(path: Path, shot: Shot, times: Array, kept: Kept) -> Detections:
     """The candidates of another detector in the pictures of a shot.
 
     Args:
         path: a table with `t` (s), `u`, `v` (px of the video), optionally `sigma_u`, `sigma_v`, `rho_uv`, `score`;
-            several rows a picture. A row belongs to the picture with the nearest stamp.
-        stamps: (f,) s, of all pictures.
-    Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range.
+            several rows a picture. A row belongs to the picture with the nearest stamp of the video; those of pictures
+            that repeat the one before are left out.
+        times: (f,) s, of the kept pictures: where others are left out, not always the stamps of the video.
+        kept: these pictures.
+    Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range, a
+        stamp before or after the video.
     """
     _, _, values = detections_file.read_columns(path, ("t", "u", "v"))
     count = len(values["t"])
     detections_file.check_values(path, values, np.arange(count), _RULES)
     values |= {name: np.full(count, value) for name, value in detections_file.UNSTATED.items() if name not in values}
     scores = values.get(detections_file.SCORE, np.full(count, SURE))
-    middle = 0.5 * (stamps[1:] + stamps[:-1])
-    frame = np.searchsorted(middle, values["t"]) - shot.first
+    stamps, t = kept.stamps, values["t"]
+    step = float(np.median(np.diff(stamps)))
+    outside = np.flatnonzero((t < stamps[0] - step) | (t > stamps[-1] + step))
+    if len(outside):
+        raise ValueError(
+            f"{path}, row {outside[0] + 1}: t must be the stamp of a picture of the video, {stamps[0]:g} to "
+            f"{stamps[-1]:g} s; got {t[outside[0]]:g}. Give t in seconds on the video's clock."
+        )
+    frame = kept.places(np.searchsorted(0.5 * (stamps[1:] + stamps[:-1]), t)) - shot.first
     rows = np.flatnonzero((frame >= 0) & (frame < len(shot)))
     rows = rows[np.argsort(frame[rows], kind="stable")]
     pixels = np.column_stack((values["u"], values["v"]))[rows]
     spread = detections_file.covariances(values)[rows]
     streaks = np.full((len(rows), 2, 2), np.nan)
-    mine = stamps[shot.first : shot.first + len(shot)]
+    mine = times[shot.first : shot.first + len(shot)]
     return Detections("main", mine, frame[rows], pixels, spread, scores[rows], streaks)
