@@ -20,7 +20,7 @@ from ballfg.tracks import csv_files
 from ballfg.tracks.rows import distinct
 
 KEYS = ("trajectory", "t")
-LABEL = "label"
+LABEL, EVENT = "label", "event"
 LARGEST = 1e12  # Largest number in a table, in SI units; sums and squares of larger ones overflow a page's numbers
 
 
@@ -63,7 +63,9 @@ class ResultTable:
 
 
 def kind_of(columns: Sequence[str]) -> Kind | None:
-    """The kind of a table with these columns; None for another table."""
+    """The kind of a table with these columns; None for another table, as of events that `ballfg predict` asked for."""
+    if EVENT in columns:
+        return None
     for kind in Kind:
         if set(KEYS) | set(kind.value) <= set(columns):
             return kind

@@ -48,6 +48,8 @@ def test_what_cannot_be_shown_says_what_could_be(made: Made, tmp_path: Path) -> 
     (tmp_path / "broken.json").write_text("{")
     (tmp_path / "broken.parquet").write_text("no table")
     write(tmp_path / "other.csv", ("a", "b"), [(1, 2)])
+    places = ("x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
+    write(tmp_path / "events.csv", ("trajectory", "event", "t", *places), [("a", "apex", 0.5, *[0.1] * 6)])
     for name, message in (
         ("missing", "does not exist; it could be a dataset"),
         ("notes.txt", "must be a dataset .*ending is '.txt'"),
@@ -55,6 +57,7 @@ def test_what_cannot_be_shown_says_what_could_be(made: Made, tmp_path: Path) -> 
         ("broken.json", "is no JSON"),
         ("broken.parquet", "must be a whole Parquet file"),
         ("other.csv", "must be a dataset .*columns are a, b"),
+        ("events.csv", "must be a dataset .*columns are trajectory, event, t"),
         ("", "holds neither dataset.yaml nor report.json"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
