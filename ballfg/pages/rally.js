@@ -194,7 +194,7 @@ function fillTable() {
     const row = body.insertRow(), top = s.end === "-x" ? 1 : -1;
     const cells = [s.stroke, s.t_start.toFixed(2), s.end.replace("-", "−"), pm(s.speed_hit, s.sigma_speed_hit, 1, 1), pm(s.speed_bounce, s.sigma_speed_bounce, 1, 1),
                    pm(s.spin_y === null ? null : top * s.spin_y, s.sigma_spin_y, 1, 0), pm(s.spin_z, s.sigma_spin_z, 1, 0), pm(s.net_clearance, s.sigma_net_clearance, 1000, 0),
-                   pm(s.bounce_x, s.sigma_bounce_x, 1, 2), pm(s.bounce_y, s.sigma_bounce_y, 1, 2), s.status];
+                   pm(s.bounce_x, s.sigma_bounce_x, 1, 3), pm(s.bounce_y, s.sigma_bounce_y, 1, 3), s.status];
     cells.forEach(words => { row.insertCell().textContent = words; });
     row.tabIndex = 0;
     row.onclick = () => { chosen = i; seek(s.t_start); };

@@ -186,7 +186,7 @@ def _moving_camera(
     from ballfg.parallel.parts import with_jobs
     from ballfg.tracks.info import DatasetInfo
     from ballfg.vision.broadcast.court import TABLE_TENNIS, read_court
-    from ballfg.vision.broadcast.files import FILES
+    from ballfg.vision.broadcast.files import FILES, TRACKED
     from ballfg.vision.broadcast.given import read_candidates, read_corners
     from ballfg.vision.detection.video import open_video
     from ballfg.vision.tracking.dataset import check_result_folder
@@ -221,7 +221,7 @@ def _moving_camera(
             surfaces_of(ground).table_height,
             kind.ball,
             rate=rate,
-            source=f"ballfg track {path.name}",
+            source=TRACKED + path.name,
             table_extent=surfaces_of(ground).extent,
         )
         text = "" if court == TABLE_TENNIS else Path(court).read_text(encoding="utf-8")

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from ballfg.tracks import csv_files
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, read_info
 from ballfg.vision.broadcast.court import TABLE_TENNIS, read_court
-from ballfg.vision.broadcast.files import COURT, EVENTS, MOTION, STATES, STROKES, VIDEOS
+from ballfg.vision.broadcast.files import COURT, EVENTS, MOTION, STATES, STROKES, TRACKED, VIDEOS
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
 
@@ -77,7 +78,7 @@ def _video(folder: Path, source: str, given: Path | None, out: Path) -> tuple[st
     """The address of the video for a page, and a note if it is not inside."""
     if given is not None and not given.is_file():
         raise FileNotFoundError(f"{given} does not exist; it could be the video of {folder}. Check the path.")
-    name = Path(source.rpartition(" ")[2]).name
+    name = Path(source.removeprefix(TRACKED)).name  # it may have spaces
     places = [given] if given is not None else [at / name for at in (folder, folder.absolute().parent, Path())]
     found = next((one for one in places if name and one.is_file() and one.suffix.lower() in VIDEOS), None)
     if found is None:
@@ -87,7 +88,7 @@ def _video(folder: Path, source: str, given: Path | None, out: Path) -> tuple[st
     if found.stat().st_size <= SMALL:
         return f"data:video/mp4;base64,{base64.b64encode(found.read_bytes()).decode('ascii')}", []
     link = os.path.relpath(found.absolute(), out.absolute().parent).replace(os.sep, "/")
-    return link.replace('"', "%22"), [f"The video has more than {SMALL // 2**20} MB: the page links to {link}."]
+    return quote(link), [f"The video has more than {SMALL // 2**20} MB: the page links to {link}."]
 
 
 def _read(path: Path) -> Rows:

@@ -13,6 +13,8 @@ COURT: Final = "court.yaml"
 FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES, COURT)
 """All written files."""
 VIDEOS: Final = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi")
+TRACKED: Final = "ballfg track "
+"""Before the name of the video in the source of a rally's dataset."""
 
 
 def is_rally(folder: Path) -> bool:

@@ -8,6 +8,7 @@ import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -283,6 +284,25 @@ def test_a_small_video_is_inside_and_a_large_one_is_linked(folder: Path, tmp_pat
     assert "8 MB" in notes[0]
 
 
+def test_the_video_of_a_rally_is_found_by_its_whole_name_and_linked_by_an_address(folder: Path, tmp_path: Path) -> None:
+    """Of `my r.mp4`, not of `r.mp4` beside it; signs of addresses in a name stay signs of the name."""
+    other, source = tmp_path / "other", "ballfg track my r.mp4"
+    shutil.copytree(folder, other)
+    (other / "dataset.yaml").write_text((other / "dataset.yaml").read_text().replace("ballfg track r.mp4", source))
+    (tmp_path / "r.mp4").write_bytes(b"another")
+    _, notes = rally_page(other, None, tmp_path / "page.html")
+    assert "my r.mp4 was not found" in notes[0]
+    (tmp_path / "my r.mp4").write_bytes(b"video")
+    assert "base64,dmlkZW8=" in rally_page(other, None, tmp_path / "page.html")[0]
+    large = tmp_path / 'a#1 50%&"<b>.mp4'
+    with large.open("wb") as file:
+        file.truncate(9 * 2**20)
+    page, _ = rally_page(other, large, tmp_path / "page.html")
+    (address,) = re.findall(r'src="([^"]*)"', page)
+    assert not set(address) & set("#&<?")
+    assert unquote(address) == large.name
+
+
 PLAY = """
 const frame = document.querySelector("iframe");
 frame.addEventListener("load", () => setTimeout(() => {
@@ -293,6 +313,7 @@ frame.addEventListener("load", () => setTimeout(() => {
   const found = {rows: rows.length, bounces: inside.querySelectorAll("#above ellipse").length,
                  bars: inside.querySelectorAll("#line rect").length,
                  wide: inside.documentElement.scrollWidth - inside.documentElement.clientWidth};
+  found.cells = Array.from(rows).map(row => Array.from(row.cells).map(cell => cell.textContent));
   rows[1].click();
   found.clicked = inside.getElementById("readout").textContent;
   found.overlay = drawn("overlay"); found.space = drawn("space");
@@ -320,6 +341,9 @@ def test_a_browser_draws_the_rally_and_a_click_goes_to_its_stroke(
     assert found["rows"] == found["bars"] == len(rally.strokes)
     assert found["bounces"] == sum(event.kind == "bounce" for event in rally.events)
     assert found["wide"] <= 0
+    unsure = [float(cell.split(" ± ")[1]) for row in found["cells"] for cell in row if " ± " in cell]
+    assert len(unsure) > 4 * len(rally.strokes)
+    assert min(unsure) > 0.0, "a bounce's place is shown as exact"
     hit = next(e for e in rally.events if e.kind == "hit" and e.trajectory == rally.strokes[1]["stroke"])
     assert found["clicked"].startswith(f"t = {hit.t:.3f} s")
     assert f"stroke {rally.strokes[1]['stroke']}" in found["clicked"]
