@@ -142,7 +142,8 @@ class TraineeKind(ABC):
     name: ClassVar[str]
     """Value of the config's key `kind`."""
     unused: ClassVar[tuple[str, ...]] = ()
-    """Keys of the config without effect on this kind; a config that sets one is refused."""
+    """Keys of the config without effect on this kind, such as `model` or `launcher.start`; a config that sets one is
+    refused."""
     augmented: ClassVar[bool] = False
     """True if training tracks are rotated and shifted unless the config says otherwise."""
 

@@ -300,6 +300,9 @@ class TrainConfig(Section):
     @model_validator(mode="after")
     def _fields_fit_kind(self) -> Self:
         for name in TRAINEES[self.kind].unused:
-            if getattr(self, name) != type(self).model_fields[name].default:
+            given, default = self, TrainConfig.model_construct()
+            for part in name.split("."):
+                given, default = getattr(given, part), getattr(default, part)
+            if given != default:
                 raise ValueError(f"'{name}' plays no part in kind '{self.kind}'. Leave it out.")
         return self

@@ -123,7 +123,10 @@ class SequenceTrainee(Trainee):
 class SequenceModelKind(TraineeKind):
     """A network from observations to the rest of a track, on the same shots as a model of the dynamics would have."""
 
-    unused: ClassVar[tuple[str, ...]] = ("architecture", "model", "noise", "gradient", "options")
+    unused: ClassVar[tuple[str, ...]] = (
+        *("architecture", "model", "noise", "gradient", "loss", "options"),
+        *("launcher.start", "optimizer.noise_step", "optimizer.coefficient_step"),
+    )
     augmented = True
 
     @classmethod
