@@ -62,6 +62,11 @@ def visible(text: str) -> str:
     return "".join(letter if is_visible(letter) else ascii(letter)[1:-1] for letter in text)
 
 
+def drawn(text: str) -> str:
+    """The text for a picture of matplotlib, which would read what stands between two `$` as mathematics."""
+    return text.replace("$", r"\$")
+
+
 def one_line(error: object) -> str:
     """The text of an error on one line, without its full stop."""
     return visible(" ".join(str(error).split())).rstrip(".")

@@ -10,6 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from ballfg.checks import (
     as_float,
@@ -26,6 +29,7 @@ from ballfg.checks import (
     check_range,
     check_text,
     did_you_mean,
+    drawn,
     is_number,
     one_line,
     short_text,
@@ -206,6 +210,17 @@ def test_text_may_have_lines_but_nothing_that_a_terminal_obeys():
     for text in ("\x1b[2J", "a\u202eb", "a" * 2001):
         with pytest.raises(ValueError, match="source must be text of at most 2000 characters"):
             check_text("source", text)
+
+
+@pytest.mark.parametrize("name", ["a$_^$0", "$x$", "1 $", "plain_1^2"])
+def test_a_name_is_drawn_to_the_letter(name):
+    """As wide as matplotlib draws it where it reads no mathematics at all."""
+    canvas = FigureCanvasAgg(Figure()).get_renderer()
+    escaped, raw = (
+        Text(0.0, 0.0, words, figure=Figure(), parse_math=math).get_window_extent(canvas)
+        for words, math in ((drawn(name), True), (name, False))
+    )
+    assert escaped.bounds == raw.bounds
 
 
 def test_what_messages_print_is_visible():

@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 from matplotlib.figure import Figure
 
+from ballfg.checks import drawn
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.pages.pictures import by_axis
@@ -33,7 +34,7 @@ def picture(estimate: Estimate) -> Figure:
         panels[k].set_ylabel(f"{part}, {unit}")
         panels[k].grid(alpha=0.3)
     panels[0].legend(ncols=3, loc="upper right")
-    panels[0].set_title(f"track {estimate.name}: states with two standard deviations; dashed: contacts")
+    panels[0].set_title(f"track {drawn(estimate.name)}: states with two standard deviations; dashed: contacts")
     panels[2].set_xlabel("time, s")
     return figure
 

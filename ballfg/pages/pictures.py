@@ -8,6 +8,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from ballfg.arrays import Array
+from ballfg.checks import drawn
 from ballfg.pages.outline import Outline
 from ballfg.pages.shot import HALF_WIDTH, ShownShot, unbroken
 
@@ -60,7 +61,7 @@ def by_axis(shot: ShownShot) -> Figure:
         panel.set_ylabel(f"{AXES[a]}, m")
         panel.grid(alpha=0.3)
     panels[0].legend(ncols=3, fontsize="small")
-    panels[0].set_title(f"track {shot.name}: positions with 90 % intervals")
+    panels[0].set_title(f"track {drawn(shot.name)}: positions with 90 % intervals")
     panels[2].set_xlabel("time, s")
     return figure
 

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from ballfg.checks import drawn
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.generic import FUNCTIONS, AirCorrection
@@ -41,7 +42,7 @@ def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> No
     _errors(axes[panels - 1], comparison)
     for unused in axes[panels:]:
         unused.set_axis_off()
-    title = f"{problem.dataset.info.name}: {len(last.fits)} tracks fitted, {len(comparison.pairs)} judge"
+    title = f"{drawn(problem.dataset.info.name)}: {len(last.fits)} tracks fitted, {len(comparison.pairs)} judge"
     figure.suptitle(title, size=11)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=DPI, format="png")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from matplotlib.figure import Figure
 
 import ballfg as bf
 from ballfg.diagnosis import Diagnosis
+from ballfg.pages.pictures import by_axis
+from ballfg.pages.shot import ShownShot
 from tests.diagnosis.made_diagnosis import found, silent
 from tests.pages.made import Fall, Made, make
 
@@ -69,3 +72,10 @@ def test_a_prediction_against_what_was_measured(small: Made) -> None:
 @pytest.mark.parametrize(("diagnosis", "label"), [(found(), "prediction error, mm"), (silent(), "density")])
 def test_a_diagnosis(diagnosis: Diagnosis, label: str) -> None:
     assert diagnosis.plot().axes[0].get_ylabel() == label
+
+
+def test_a_name_with_signs_of_mathematics_is_drawn(estimate: bf.Estimate, tmp_path: Path) -> None:
+    named = replace(estimate, name="a$_^$0")
+    for figure in (named.plot(), by_axis(ShownShot(named.name, named.times, named.states[:, :3]))):
+        figure.savefig(tmp_path / "named.png")
+        assert r"track a\$_^\$0: " in figure.axes[0].get_title()

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from ballfg.checks import drawn
 from ballfg.vision.arrays import Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
 from ballfg.vision.calibration.intrinsics import CELLS, RAYS, USUAL_VIEWS, Intrinsics
@@ -171,7 +172,7 @@ def _corners(axes: Axes, lens: Intrinsics) -> None:
     longer = ARROW * width / (3.0 * typical) if typical > 0.0 else 1.0
     axes.quiver(*pixels.T, *(longer * residuals).T, angles="xy", scale_units="xy", scale=1, width=0.002, color=BLUE)
     axes.set_title(
-        f"{lens.camera.name}: corners as seen minus as projected, x{longer:.0f}\n"
+        f"{drawn(lens.camera.name)}: corners as seen minus as projected, x{longer:.0f}\n"
         f"RMS {lens.rms:.2f} px; corners in {lens.coverage:.0%} of the cells",
         size=9,
     )
@@ -185,10 +186,10 @@ def _views(axes: Axes, lens: Intrinsics) -> None:
     axes.axhline(lens.rms, color=GREY, linewidth=0.8)
     if lens.left_out:  # a wrong view is worse by so much that the others could not be seen beside it
         axes.set_yscale("log")
-    axes.set_xticks(places, [one.view.name for one in fitted], rotation=90, size=6)
+    axes.set_xticks(places, [drawn(one.view.name) for one in fitted], rotation=90, size=6)
     axes.set_ylabel("RMS, px")
     orange = "; orange: left out" if lens.left_out else ""
-    axes.set_title(f"{lens.camera.name}: error of each view{orange}", size=9)
+    axes.set_title(f"{drawn(lens.camera.name)}: error of each view{orange}", size=9)
 
 
 def _table(axes: Axes, place: Extrinsics, image: Image | None, table_height: float) -> None:
@@ -204,7 +205,7 @@ def _table(axes: Axes, place: Extrinsics, image: Image | None, table_height: flo
     for name, pixel in zip(place.marked.names, place.marked.pixels, strict=True):
         axes.annotate(name, pixel, (4, 4), textcoords="offset points", size=6, color=BLUE, path_effects=[OUTLINED])
     axes.set_title(
-        f"{place.camera.name}: the table as projected; circles: as marked\n"
+        f"{drawn(place.camera.name)}: the table as projected; circles: as marked\n"
         f"RMS {place.rms:.2f} px; camera ± {1e3 * place.centre_sigma:.1f} mm, ± {np.degrees(place.turn_sigma):.2f}°",
         size=9,
     )

@@ -11,6 +11,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
 from ballfg.arrays import Array, Index
+from ballfg.checks import drawn
 from ballfg.vision.arrays import Image
 from ballfg.vision.tracking.overlay import Colour, bgr, by_score, hexadecimal, polyline, ring, uncover
 from ballfg.vision.tracking.pipeline import Tracking
@@ -126,7 +127,7 @@ class ContactSheet:
         for row, track, pictures in zip(panels, self._shown, self._views, strict=True):
             for camera, (panel, view) in enumerate(zip(row, pictures, strict=False)):
                 self._draw_view(panel, view, track, camera)
-            row[0].set_title(f"track {self._tracking.names[track]}     " + row[0].get_title(), size=8)
+            row[0].set_title(f"track {drawn(self._tracking.names[track])}     " + row[0].get_title(), size=8)
             self._draw_space(row[-2:], track)
         for panel in panels[-1, -2:]:
             panel.set_xlabel("x, m", size=8)
@@ -143,7 +144,7 @@ class ContactSheet:
         ball, model = self._tracking.balls[track], self._tracking.cameras[camera]
         marks = self._tracking.seen(ball, camera).pixels
         _show(panel, view.picture(marks, [bgr(track)] * len(marks), model.project(ball.points)))
-        panel.set_title(f"{model.name}: {len(marks)} sightings", size=8)
+        panel.set_title(f"{drawn(model.name)}: {len(marks)} sightings", size=8)
 
     def _draw_space(self, panels: Sequence[Axes], track: int) -> None:
         """The points with their standard deviations from the side and from above; one scale in all rows."""
@@ -181,7 +182,7 @@ class ContactSheet:
             best = np.argsort(-seen.scores, kind="stable")[:MOST_RINGS][::-1]
             _show(panel, view.picture(seen.pixels[best], [by_score(s) for s in seen.scores[best]], np.zeros((0, 2))))
             scores = ", ".join(f"{score:.2f}" for score in seen.best_scores()) or "none"
-            panel.set_title(f"{seen.camera}: best scores {scores}", size=8)
+            panel.set_title(f"{drawn(seen.camera)}: best scores {scores}", size=8)
         figure.suptitle("no ball: candidates of all frames, the brighter the likelier", size=10)
         return figure
 
