@@ -229,7 +229,7 @@ def coverage(shots: Iterable[ShownShot]) -> Coverage:
     tracks: dict[int, int] = {}
     for shot in shots:
         errors, ahead = np.abs(shot.prediction_errors()), shot.horizons()
-        known = np.isfinite(errors).all(axis=1) & np.isfinite(ahead)
+        known = np.isfinite(errors).all(axis=1) & np.isfinite(ahead) & ~np.isnan(shot.predicted_sigmas).any(axis=1)
         inside = errors[known] <= HALF_WIDTH * shot.predicted_sigmas[known]
         bins = np.floor((ahead[known] + SAME_STAMP) / BIN).astype(int)
         for b in np.unique(bins).tolist():

@@ -26,7 +26,7 @@ const hasPredictions = () => shot.predicted_t.length > 0;
 const pathTimes = () => hasStates() ? shot.state_t : shot.t.length ? shot.t : shot.predicted_t;
 const pathPlaces = () => hasStates() ? shot.states.slice(0, 3) : shot.t.length ? shot.positions : shot.predicted;
 const mm = value => value === null || value === undefined ? "unknown" : (1000 * value).toPrecision(3) + " mm";
-const subtract = (a, b) => a.map((value, i) => value === null || b[i] === null ? null : value - b[i]);
+const metres = (value, digits) => value === null ? "unknown" : value.toFixed(digits) + " m";
 
 function layout(extra) {
   const line = {gridcolor: colour("--line"), zerolinecolor: colour("--line")};
@@ -76,7 +76,7 @@ function surroundings() {
 
 // A tube about a path: rings across the flight, as wide as the standard deviations in these directions.
 function tube(times, places, sigmas, correlations, scale, style) {
-  const rows = places[0].map((_, i) => i).filter(i => sigmas.every(s => s[i] !== null));
+  const rows = places[0].map((_, i) => i).filter(i => [...sigmas, ...places].every(s => s[i] !== null));
   if (rows.length < 2) return [];
   const x = [], y = [], z = [], faces = [[], [], []];
   rows.forEach((row, number) => {
@@ -155,7 +155,7 @@ function broken(trace, times) {
   return result;
 }
 
-const placeWords = (places, i) => AXES.map((a, k) => `${a} ${places[k][i].toFixed(4)} m`).join("<br>");
+const placeWords = (places, i) => AXES.map((a, k) => `${a} ${metres(places[k][i], 4)}`).join("<br>");
 
 function spread(sigmas, i) {
   return sigmas.every(s => s[i] === null) ? "" : "<br>standard deviations " + sigmas.map(s => mm(s[i])).join(", ");
@@ -167,8 +167,9 @@ function spinArrows() {
   const x = [], y = [], z = [], heads = {x: [], y: [], z: [], u: [], v: [], w: [], text: []};
   for (let i = 0; i < count; i += every) {
     const spin = shot.states.slice(6, 9).map(s => s[i]);
-    if (spin.some(s => s === null) || !flies(i)) continue;
-    const from = shot.states.slice(0, 3).map(p => p[i]), to = from.map((p, a) => p + SPIN_LENGTH * spin[a]);
+    const from = shot.states.slice(0, 3).map(p => p[i]);
+    if ([...spin, ...from].includes(null) || !flies(i)) continue;
+    const to = from.map((p, a) => p + SPIN_LENGTH * spin[a]);
     x.push(from[0], to[0], null); y.push(from[1], to[1], null); z.push(from[2], to[2], null);
     heads.x.push(to[0]); heads.y.push(to[1]); heads.z.push(to[2]);
     const way = unit(spin);
@@ -215,7 +216,7 @@ function room() {
                                                       [page.table.height, page.table.floor ?? page.table.height]];
   const known = shot.t.length || hasStates() ? [shot.positions, shot.states] : [shot.predicted];
   const around = places => [0, 1, 2].map(a => {
-    const values = [...table[a], ...known.flatMap(rows => rows[a] ?? []), ...places.map(place => place[a])];
+    const values = [...table[a], ...known.flatMap(rows => rows[a] ?? []), ...places.map(place => place[a])].filter(value => value !== null);
     return [Math.min(...values) - MARGIN, Math.max(...values) + MARGIN];
   });
   const seen = withCameras() ? shot.rays.map(rays => page.cameras.find(one => one.name === rays.camera).place) : [];
@@ -386,7 +387,7 @@ function drawDiagnosis() {
 
 function showMoment() {
   const i = Number(element("moment").value), times = pathTimes(), places = pathPlaces();
-  const words = [`t = ${times[i].toFixed(3)} s`, AXES.map((a, k) => `${a} ${places[k][i].toFixed(3)} m`).join(", ")];
+  const words = [`t = ${times[i].toFixed(3)} s`, AXES.map((a, k) => `${a} ${metres(places[k][i], 3)}`).join(", ")];
   if (hasStates()) {
     const [velocity, spin] = [shot.states.slice(3, 6), shot.states.slice(6, 9)].map(part => part.map(row => row[i]));
     words[1] += ` (± ${shot.state_sigmas.map(s => mm(s[i])).join(", ")})`;

@@ -94,6 +94,40 @@ def test_bands_end_at_gaps(tmp_path: Path) -> None:
         assert (max(before), min(after)) == (0.34, 0.48)
 
 
+UNKNOWN = """
+const frame = document.querySelector("iframe");
+frame.addEventListener("load", () => setTimeout(() => {
+  const inside = frame.contentDocument, space = inside.getElementById("space"), found = [];
+  for (const one of space.data) for (const value of one.x) if (value !== null) found.push(value);
+  const {xaxis} = space.layout.scene, readout = inside.getElementById("readout").textContent;
+  document.body.dataset.found = JSON.stringify({least: Math.min(...found), range: xaxis.range, readout});
+}, 3000));
+"""
+
+
+def test_unknown_states_are_drawn_nowhere(tmp_path: Path) -> None:
+    """A ball that flies from x = 3 m on over a table under its middle: an unknown place is not at x = 0."""
+    made = make(tmp_path, {"a": Fall()}, extent=False)
+    for path, column in ((made.dataset / "tracks.csv", 2), (made.states, 2), (made.predictions, 2)):
+        head, *rows = (line.split(",") for line in path.read_text().splitlines())
+        moved = [[*row[:column], float(row[column]) + 3.0, *row[column + 1 :]] for row in rows]
+        write(path, head, moved)
+    head, *rows = (line.split(",") for line in made.states.read_text().splitlines())
+    write(
+        made.states,
+        head,
+        [[*row[:2], *["nan"] * 3, *row[5:]] if k in (0, 30, 31) else row for k, row in enumerate(rows)],
+    )
+    page = show_page(collect(recognise([made.dataset, made.states, made.predictions])))
+    elements, console = opened(page, 1200, UNKNOWN, tmp_path)
+    assert not re.search(r"error|uncaught|exception", "\n".join(console), flags=re.IGNORECASE), console
+    (found,) = re.findall(r'<body data-found="([^"]*)"', elements)
+    shown = json.loads(html.unescape(found))
+    assert shown["readout"].startswith("t = 0.000 s · x unknown, y unknown, z unknown")
+    assert shown["least"] > 2.0
+    assert shown["range"][0] > 2.0
+
+
 def test_a_hostile_name_runs_nothing_and_two_samples_are_drawn(tmp_path: Path) -> None:
     falls = {"<img src=x onerror=document.title='run'>": Fall(samples=2), "</script><b>": Fall()}
     made = make(tmp_path, falls, extent=False)

@@ -55,6 +55,15 @@ def test_horizons_of_a_recording_count_from_what_each_flight_observed() -> None:
     np.testing.assert_array_equal(two.samples, 2 * one.samples)
 
 
+def test_a_prediction_of_unknown_width_is_not_counted() -> None:
+    (shot,) = shots(1, np.inf)
+    sigmas = shot.predicted_sigmas.copy()
+    sigmas[::2, 1] = np.nan
+    found = coverage([replace(shot, predicted_sigmas=sigmas)])
+    assert found.samples.sum() == len(sigmas) // 2
+    assert (found.shares == 1.0).all()
+
+
 def test_infinite_intervals_hold_everything_and_no_prediction_gives_no_bins() -> None:
     assert (coverage(shots(3, np.inf)).shares == 1.0).all()
     assert coverage([ShownShot("a", np.zeros(1), np.zeros((1, 3)))]).shares.shape == (0, 3)
