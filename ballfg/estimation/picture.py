@@ -10,6 +10,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.pages.pictures import by_axis
 from ballfg.pages.shot import Mark, ShownShot
+from ballfg.state import VELOCITY
 
 PARTS: Final = (("position", "m"), ("velocity", "m/s"), ("spin", "rad/s"))
 AXES: Final = ("x", "y", "z")
@@ -17,16 +18,24 @@ COLOURS: Final = ("#c44e52", "#55a868", "#4c72b0")
 
 
 def picture(estimate: Estimate) -> Figure:
-    """Three panels, one for each part of the state; contacts are dashed lines, hits are dotted ones."""
+    """Three panels, one for each part of the state; contacts are dashed lines, hits are dotted ones.
+
+    Nothing is drawn in steps of more than `gap` of a shot, nor velocity and spin of samples that are left as measured.
+    """
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
-    times, sigmas = estimate.times, estimate.sigmas
+    times, states = estimate.times, estimate.states.copy()
+    unmoved = (states[:, VELOCITY.start :] == 0.0).all(
+        axis=1
+    )  # left as measured, as of a held ball: no motion is known
+    states[unmoved, VELOCITY.start :] = np.nan
+    at, means, sigmas = ShownShot(estimate.name, state_times=times).broken(times, states, estimate.sigmas)
     for k, (part, unit) in enumerate(PARTS):
         for axis in range(3):
             column = 3 * k + axis
-            mean, band = estimate.states[:, column], 2.0 * sigmas[:, column]
-            panels[k].plot(times, mean, color=COLOURS[axis], label=AXES[axis], linewidth=1.2)
-            panels[k].fill_between(times, mean - band, mean + band, color=COLOURS[axis], alpha=0.2, linewidth=0.0)
+            mean, band = means[:, column], 2.0 * sigmas[:, column]
+            panels[k].plot(at, mean, color=COLOURS[axis], label=AXES[axis], linewidth=1.2)
+            panels[k].fill_between(at, mean - band, mean + band, color=COLOURS[axis], alpha=0.2, linewidth=0.0)
         for contact in estimate.contacts:
             panels[k].axvline(contact.time, color="0.5", linestyle="--", linewidth=0.8)
         for interval in estimate.hits:

@@ -125,8 +125,8 @@ class ShownShot:
         flies = np.full(len(self.states), True) if self.flying is None else np.array(self.flying)
         places = np.where(flies[:, None], self.states[:, :3], np.nan)
         return [
-            ("estimate", *self._broken(self.state_times, places, estimated)),
-            ("prediction", *self._broken(self.predicted_times, self.predicted, predicted)),
+            ("estimate", *self.broken(self.state_times, places, estimated)),
+            ("prediction", *self.broken(self.predicted_times, self.predicted, predicted)),
         ]
 
     @property
@@ -135,7 +135,8 @@ class ShownShot:
         steps = [np.diff(times) for times in (self.times, self.state_times, self.predicted_times)]
         return max(GAP, *(2.0 * float(np.median(one)) for one in steps if len(one)), 0.0)
 
-    def _broken(self, times: Array, places: Array, spread: Array) -> tuple[Array, Array, Array]:
+    def broken(self, times: Array, places: Array, spread: Array) -> tuple[Array, Array, Array]:
+        """Stamps (k,) s and rows (k, ...) at them, with one more row of NaN in each step of more than `gap`."""
         after = np.flatnonzero(np.diff(times) > self.gap) + 1
         cut, wide = (np.insert(rows, after, np.nan, axis=0) for rows in (places, spread))
         return np.insert(times, after, np.nan), cut, wide

@@ -79,3 +79,20 @@ def test_a_name_with_signs_of_mathematics_is_drawn(estimate: bf.Estimate, tmp_pa
     for figure in (named.plot(), by_axis(ShownShot(named.name, named.times, named.states[:, :3]))):
         figure.savefig(tmp_path / "named.png")
         assert r"track a\$_^\$0: " in figure.axes[0].get_title()
+
+
+def test_states_are_not_drawn_over_a_gap_nor_a_motion_that_nobody_estimated(estimate: bf.Estimate) -> None:
+    """The first ten samples are left as measured, as of a held ball; half a second is missing after the twentieth."""
+    times, states = estimate.times.copy(), estimate.states.copy()
+    states[:10, 3:], times[20:] = 0.0, times[20:] + 0.5
+    panels = replace(estimate, times=times, states=states).plot().axes
+    for k, panel in enumerate(panels):
+        for axis, line in enumerate(panel.lines[:3]):
+            at, drawn = line.get_data()
+            assert np.isnan(at[20])
+            assert np.isnan(drawn[20])
+            known = np.delete(drawn, 20)
+            assert np.isnan(known[:10]).all() == (k > 0)
+            np.testing.assert_array_equal(known[10:], states[10:, 3 * k + axis])
+    widths = [one.get_datalim(panels[1].transData).height for one in panels[1].collections]
+    assert max(widths) < 10.0
