@@ -1,4 +1,4 @@
-"""How a window's iSAM2 is set up, and updates that keep its points."""
+"""Sets up the iSAM2 of a window, and updates that keep its points."""
 
 from collections.abc import Iterable, Sequence
 
