@@ -81,10 +81,13 @@ def contact_ahead(start: "BallState", carried: Carried, horizon: float) -> tuple
     """The next contact within a horizon, s, and the probability that there is one.
 
     While the state is in doubt whether the ball has bounced just now, a ball on the other side has another contact: the
-    bounce itself, or the one after it. The numbers of the mean's contact then spread to that one too.
+    bounce itself, or the one after it. The numbers of the mean's contact then spread to that one too. Likewise to the
+    contacts of balls that pass an end of the table on the other side than the mean.
     """
     found, end = next_contact(*carried, horizon + LATER), start.time + horizon
     chance = 0.0 if found is None else _sooner(found, end - found.time)
+    if _may_pass_an_end(start, carried[0].surfaces, found):
+        found, chance = _past_or_not(start, carried, horizon, (found, chance))
     share, other = _other_contact(start, carried, found, horizon)
     if other is not None:
         chance += share * (_sooner(other, end - other.time) - chance)
@@ -93,6 +96,36 @@ def contact_ahead(start: "BallState", carried: Carried, horizon: float) -> tuple
             time_sigma = math.hypot(found.time_sigma, math.sqrt(share) * late)
             found = replace(found, time_sigma=time_sigma, covariance=found.covariance + share * np.outer(off, off))
     return (None if found is None or found.time > end else found), chance
+
+
+def _may_pass_an_end(start: "BallState", surfaces: Surfaces, found: Crossing | None) -> bool:
+    """Whether some balls may come down on the table and others past its ends."""
+    if surfaces.extent is None or not start.state[Z] > surfaces.table_height:
+        return False
+    if found is None or not found.state[Z] > surfaces.table_height:
+        return True
+    near = FAR * np.hypot(np.sqrt(np.diagonal(found.covariance)[:2]).repeat(2), surfaces.edge_sigmas)
+    return bool((np.abs(found.state[:2].repeat(2) - surfaces.extent) < near).any())
+
+
+def _past_or_not(
+    start: "BallState", carried: Carried, horizon: float, mean: tuple[Crossing | None, float]
+) -> tuple[Crossing | None, float]:
+    """The mean's contact and its probability; from possible balls if these differ in the surface that they meet."""
+    balls, heights = Path(start, carried, horizon + LATER).possible, carried[0].surfaces.heights()
+    bounces = np.diff(balls.met, axis=1) > 0.0
+    rows = np.flatnonzero(bounces.any(axis=1))
+    at = bounces[rows].argmax(axis=1)
+    states, times = balls.states[rows, at], balls.times[rows, at]
+    upper = int((states[:, Z] > sum(heights) / len(heights)).sum())
+    if len(rows) == len(bounces) and upper in (0, len(rows)):
+        return mean
+    found, chance = mean[0], float((times <= horizon).sum() / len(bounces))
+    if found is None or not len(rows):
+        return found, chance
+    off, late = states - found.state, times - (found.time - start.time)
+    time_sigma, covariance = math.sqrt(float((late**2).mean())), off.T @ off / len(off)
+    return replace(found, time_sigma=time_sigma, covariance=covariance), chance
 
 
 def _sooner(found: Crossing, left: float) -> float:

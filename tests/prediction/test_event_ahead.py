@@ -242,6 +242,29 @@ def test_possible_balls_move_as_every_other_ball_does(world, surfaces):
         assert balls.states[..., 2].min() > 0.01  # no moment lies below the table
 
 
+@pytest.mark.parametrize("floor", [-0.76, None])
+@pytest.mark.parametrize("end", [0.55, 0.6, 0.66])
+@pytest.mark.parametrize("horizon", [0.2, 0.25, 0.8])
+def test_a_contact_near_the_end_of_a_table_is_that_of_balls_on_both_sides(world, floor, end, horizon):
+    """Some balls come down on the table, the others fall past it to the floor, if there is one."""
+    sigmas, surfaces = np.array([0.01] * 3 + [0.2] * 3 + [20.0] * 3), Surfaces(0.0, floor, (-2.0, end, -0.7, 0.7))
+    ball = BallState(3.0, FALLING, np.diag(sigmas**2), (), World(world.model, surfaces, NEARLY_EXACT))
+    first = torch.from_numpy(FALLING + sigmas * np.random.default_rng(3).standard_normal((DRAWS // 4, 9)))
+    times = torch.linspace(0.0025, horizon, round(horizon / 0.0025), dtype=torch.float64)
+    later = rollout(world.model, first, times, surfaces).numpy()
+    rises = np.diff(later[..., VZ], axis=1) > 0.1
+    rows, at = np.flatnonzero(rises.any(axis=1)), rises.argmax(axis=1)
+    told = ball.predict(horizon).event("next-contact")
+    low, high = stats.binom.interval(0.999, 2 * PAIRS, len(rows) / len(first))
+    assert low <= 2 * PAIRS * told.probability <= high
+    if horizon == 0.8 and told.crossing is not None:
+        there, when = later[rows, at[rows]], times.numpy()[at[rows]] + 3.0
+        about = np.sqrt(np.square(there - told.crossing.state).mean(axis=0))[[0, 2, 5]]
+        own = np.sqrt(np.diagonal(told.crossing.covariance))[[0, 2, 5]]
+        assert own == pytest.approx(about, rel=0.25, abs=6e-3)  # rollouts by 2.5 ms, at 2.4 m/s
+        assert told.crossing.time_sigma == pytest.approx(np.sqrt(np.square(when - told.crossing.time).mean()), rel=0.25)
+
+
 VAGUE = np.array([0.01, 0.01, 0.02, 0.1, 0.1, 0.1, 20.0, 20.0, 20.0])
 
 
