@@ -49,6 +49,20 @@ def test_the_spread_is_that_of_both_ways(model, beliefs, samples, beyond, sigma)
         assert np.abs(ratio - 1.0)[[0, 1, 2, 3, 4, 5]].max() < 0.2
 
 
+@pytest.mark.parametrize("beyond", [0.004, 0.006, 0.012])
+def test_a_bounce_of_just_now_is_in_doubt_with_the_end_of_the_table(model, beliefs, samples, beyond):
+    """At some stamps a part of the balls still falls, a part has bounced, and a part has passed the end."""
+    belief, times = beliefs(model, START), torch.linspace(0.139, 0.149, 6, dtype=torch.float64)
+    predicted = Propagator(with_end(LANDS + beyond), NEARLY_EXACT).rollout(belief, times)
+    with torch.no_grad():
+        flown = rollout(model, samples(belief, 4000), times, with_end(LANDS + beyond))
+    expected = second_moments(flown, predicted.states[0])
+    ratio = np.sqrt(np.diagonal(predicted.covariances[0], axis1=1, axis2=2) / np.diagonal(expected, axis1=1, axis2=2))
+    assert np.abs(ratio - 1.0)[:, [0, 1, 3, 5]].max() < 0.3
+    assert np.abs(ratio - 1.0)[:, 2].max() < 0.4
+    assert 0.01 < float((flown[:, -1, 5] < 0.0).double().mean()) < 0.5  # pass the end
+
+
 def test_far_from_an_edge_nothing_changes(model, beliefs):
     belief = beliefs(model, START)
     plain = Propagator(Surfaces(0.0, -5.0), NEARLY_EXACT).rollout(belief, TIMES)

@@ -9,12 +9,12 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.beliefs.carry import add_impact, through
-from ballfg.dynamics.compiled.beliefs.edges import gap_of, level_below, over_table
+from ballfg.dynamics.compiled.beliefs.edges import come_down, gap_of, level_below, over_table, share_over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import meet
 from ballfg.dynamics.compiled.flight import evaluate, fly_one, laws_of, laws_of_one
 from ballfg.dynamics.compiled.signatures import FLAG, FOUR, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO, Law, Laws
-from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA
+from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA, NEGLIGIBLE
 
 FAR = 4.5
 """Standard deviations of the gap beyond which all balls count as being on one side of a contact. At 4.5, one ball in
@@ -93,6 +93,25 @@ def _bounced(of_mean, change, mean, covariance, level, world, noise):
     return True
 
 
+@machine_code(REAL(LAWS, ONE, TWO, REAL, ONE))
+def _past(laws, mean, covariance, level, world):
+    """Share of balls that miss the table at a level (m), some time before or after the mean comes down there."""
+    if level != world[0]:
+        return 0.0
+    d, touch = len(mean), np.empty(9)
+    tau = come_down(laws, mean[:9], level, world, touch)
+    if not (math.isfinite(tau) and touch[5] < 0.0):
+        return 0.0
+    then, there = np.zeros((9, d)), np.empty((d, d))
+    for i in range(9):
+        then[i, i] = 1.0
+    for i in range(3):
+        then[i, 3 + i] = tau
+    through(then, covariance, there)
+    past = 1.0 - share_over_table(touch, there, world)
+    return 0.0 if past < NEGLIGIBLE else past
+
+
 @machine_code(NOTHING(REAL, ONE, TWO, ONE, TWO, ONE, TWO))
 def _join(share, above, aboves, below, belows, mean, covariance):
     """Mean (d,) and covariance (d, d) of a mixture with a share of `below`; unchanged if the share is not a number."""
@@ -119,7 +138,7 @@ def mix(
     Args: as `carry`, of any number of times.
     """
     d, all_laws = mean.shape[2], laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
-    k, own = np.empty(d), np.empty(d)
+    k, own, falling = np.empty(d), np.empty(d), np.empty(d)
     above, aboves, below, belows = np.empty(d), np.empty((d, d)), np.empty(d), np.empty((d, d))
     for time in range(mean.shape[0]):
         for r in range(mean.shape[1]):
@@ -142,5 +161,9 @@ def mix(
             _one_side(below, belows, c0, k, -density / share, below, belows)
             for i in range(d):
                 own[i] = -density / share * k[i]
+            falling[:], past = below, _past(laws, below, belows, low, world)
             if _bounced(laws, own, below, belows, low, world, noise):
+                for i in range(9):
+                    for j in range(9):
+                        belows[i, j] += past * (below[i] - falling[i]) * (below[j] - falling[j])
                 _join(share, above, aboves, below, belows, at, spread)
