@@ -179,8 +179,7 @@ def _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful):
         all; doubtful (m,), 1 where a closer look is needed: a ball that may be at rest, or falls to the floor.
     """
     m, n, none, unmoved = len(x), 0, np.empty((len(x), 9, 0)), np.empty((len(x), 3, 0))
-    under, raised, surface, up = np.empty((m, 3)), np.empty((m, 3)), laws.surface, np.zeros(3)
-    up[2] = 1.0
+    under, raised, surface, up = np.empty((m, 3)), np.empty((m, 3)), laws.surface, np.ones(3)
     surface.compute(x, surface.c, surface.w, none, surface.ct, under, unmoved)
     surface.compute(after, surface.c, surface.w, none, surface.ct, raised, unmoved)
     for r in range(m):
@@ -189,10 +188,11 @@ def _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful):
         height = level[n] + raised[r, 0] + world[2]
         if doubtful[r] or not (after[r, 5] < 0.0 and after[r, 2] < height):
             continue
-        if not x[r, 2] > height:
+        if not x[r, 2] > level[n] + under[r, 0] + world[2]:
             doubtful[r] = 1
             continue
-        tau[n] = _crossed(x[r], after[r], h, up, height, touch[n])
+        up[0], up[1] = -raised[r, 1], -raised[r, 2]
+        tau[n] = _crossed(x[r], after[r], h, up, height + up[0] * after[r, 0] + up[1] * after[r, 1], touch[n])
         if level[n] == world[0] and not over_table(touch[n], world):
             doubtful[r] = int(gap_of(only(surface, r), after[r], world[1], world[2]) < 0.0)
         else:
