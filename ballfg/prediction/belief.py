@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from statistics import NormalDist
 
 import numpy as np
 import torch
@@ -141,3 +143,25 @@ def _held(mean: Array, covariance: Array, low: Array, high: Array) -> Array:
     held = mean + covariance[:, out] @ np.linalg.solve(covariance[np.ix_(out, out)], change[out - STATE_DIM])
     held[STATE_DIM:] = np.clip(held[STATE_DIM:], low, high)  # others may have been pulled along
     return np.asarray(held)
+
+
+@cache
+def normal_points(pairs: int, width: int, seed: int = 0) -> Array:
+    """(2 pairs, width) points of a standard normal, each with its negative; mean and covariance are exactly right.
+
+    Args: width: at most the number of pairs.
+    """
+    rng, normal = np.random.default_rng(seed), NormalDist()
+    half = np.array([normal.inv_cdf(0.5 + (k + 0.5) / (2 * pairs)) for k in range(pairs)])
+    points = np.stack([rng.permutation(half) * rng.choice((-1.0, 1.0), pairs) for _ in range(width)], axis=1)
+    across, mixed = np.linalg.qr(points)
+    points = np.sqrt(pairs) * across * np.sign(np.diagonal(mixed))
+    return np.concatenate((points, -points))
+
+
+def root_of(covariance: Array) -> Array:
+    """Root (d, d) of a covariance, which may be singular."""
+    sigmas = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    scale = np.where(sigmas > 0.0, sigmas, 1.0)
+    values, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))

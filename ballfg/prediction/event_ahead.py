@@ -7,8 +7,7 @@ has an event with a small probability, or none on its mean path.
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from statistics import NormalDist
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
@@ -21,7 +20,7 @@ from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
 from ballfg.dynamics.motion.rollout import is_resting, place_on
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.prediction.belief import Belief
+from ballfg.prediction.belief import Belief, normal_points, root_of
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
 from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
@@ -121,11 +120,15 @@ def _past_or_not(
     if len(rows) == len(bounces) and upper in (0, len(rows)):
         return mean
     found, chance = mean[0], float((times <= horizon).sum() / len(bounces))
-    if found is None or not len(rows):
-        return found, chance
-    off, late = states - found.state, times - (found.time - start.time)
-    time_sigma, covariance = math.sqrt(float((late**2).mean())), off.T @ off / len(off)
-    return replace(found, time_sigma=time_sigma, covariance=covariance), chance
+    if found is not None and len(rows):
+        found = _spread_over(found, states, times - (found.time - start.time))
+    return found, chance
+
+
+def _spread_over(found: Crossing, states: Array, late: Array) -> Crossing:
+    """The mean's event with the covariance of possible balls about it: states (m, 9), late (m,) s after the mean."""
+    off = states - found.state
+    return replace(found, time_sigma=math.sqrt(float((late**2).mean())), covariance=off.T @ off / len(off))
 
 
 def _sooner(found: Crossing, left: float) -> float:
@@ -174,28 +177,6 @@ def event_numbers(found: Crossing | None) -> dict[str, float]:
     return numbers | {f"cov_{AXES[i]}{AXES[j]}": float(spread[i, j]) for i, j in ((0, 1), (0, 2), (1, 2))}
 
 
-@cache
-def normal_points(pairs: int, width: int, seed: int = 0) -> Array:
-    """(2 pairs, width) points of a standard normal, each with its negative; mean and covariance are exactly right.
-
-    Args: width: at most the number of pairs.
-    """
-    rng, normal = np.random.default_rng(seed), NormalDist()
-    half = np.array([normal.inv_cdf(0.5 + (k + 0.5) / (2 * pairs)) for k in range(pairs)])
-    points = np.stack([rng.permutation(half) * rng.choice((-1.0, 1.0), pairs) for _ in range(width)], axis=1)
-    across, mixed = np.linalg.qr(points)
-    points = np.sqrt(pairs) * across * np.sign(np.diagonal(mixed))
-    return np.concatenate((points, -points))
-
-
-def _root(covariance: Array) -> Array:
-    """Root (d, d) of a covariance, which may be singular."""
-    sigmas = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    scale = np.where(sigmas > 0.0, sigmas, 1.0)
-    values, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
-
-
 @torch.no_grad()
 def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
     """States and coefficients (n, 9 + p) at some errors; if the mean lies on a surface, so do all."""
@@ -228,29 +209,41 @@ class Path:
         kicks, ends, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
         pushes = pushed.reshape(2 * pairs, SPANS, 3)[:, : len(lasting)] * (noise[0] / np.sqrt(h * lasting))[:, None]
         off = ends * surfaces.edge_sigmas if any(surfaces.edge_sigmas) else np.zeros_like(ends)
-        start = _placed(belief, normal_points(pairs, d) @ _root(belief.covariance[0].detach().numpy()).T, surfaces)
+        start = _placed(belief, normal_points(pairs, d) @ root_of(belief.covariance[0].detach().numpy()).T, surfaces)
         chance = (pushes[:, spans], kicks * noise[[3, 3, 2]], off)
         return Scattered.of(belief.model, start, h, chance, surfaces)
 
     def crossing(self, plane: Plane) -> Crossing | None:
-        """The crossing of a plane by the mean ball; near a bounce with the covariance of all balls about it.
+        """The crossing of a plane by the mean ball, with the covariance of all balls about it that have one.
 
-        Some of them then cross the plane before the bounce and others after it.
+        Near a bounce some cross it before and others after; by an end of the table some meet it and others do not.
         """
         found = crossing_of(self.carried, plane, self.horizon)
         if found is None:
             return None
         speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
         about = FAR * (found.time_sigma + math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed)
-        contact = next_contact(*self.carried, self.horizon + LATER, after=found.time - about)
-        if contact is None or contact.time > found.time + about:
-            return found
+        by_an_end, since = self._by_an_end(found.time), found.time - about
+        if not by_an_end:
+            contact = next_contact(*self.carried, self.horizon + LATER, after=since)
+            if contact is None or contact.time > found.time + about:
+                return found
         times, states, met = self._crossings(plane)
-        if len(met) == 0 or (met == met[0]).all():
+        if len(met) == 0 or not (by_an_end or (met != met[0]).any()):
             return found
-        off, late = states - found.state, times - (found.time - self.start.time)
-        covariance = off.T @ off / len(off)
-        return replace(found, time_sigma=math.sqrt(float((late**2).mean())), covariance=covariance)
+        return _spread_over(found, states, times - (found.time - self.start.time))
+
+    def _by_an_end(self, until: float) -> bool:
+        """Whether the mean's contacts up to a time (s), or its fall past the table then, may be another ball's not."""
+        (propagator, _), since = self.carried, -np.inf
+        while propagator.surfaces.extent is not None and since < until:
+            contact = next_contact(*self.carried, self.horizon + LATER, after=since)
+            time = np.inf if contact is None else contact.time
+            past = contact is None or not contact.state[Z] > propagator.surfaces.table_height
+            if (past or time < until) and _may_pass_an_end(self.start, propagator.surfaces, contact):
+                return True
+            since = time
+        return False
 
     def _crossings(self, plane: Plane) -> tuple[Array, Array, Array]:
         """Times (m,) s since the start, states (m, 9) and numbers of bounces (m,) of the balls that cross a plane."""

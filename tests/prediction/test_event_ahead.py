@@ -280,6 +280,31 @@ def test_a_contact_near_the_end_of_a_table_is_that_of_balls_on_both_sides(world,
         assert told.crossing.time_sigma == pytest.approx(np.sqrt(np.square(when - told.crossing.time).mean()), rel=0.25)
 
 
+@pytest.mark.parametrize("text", ["z=0.1,up", "z=0.1,down,after=1", "x=1.0,after=1", "z=-0.1,down", "x=1.0"])
+@pytest.mark.parametrize("end", [0.6, 0.64, 0.7])
+def test_a_crossing_by_the_end_of_a_table_is_that_of_the_balls_that_have_one(world, text, end):
+    """Balls that fall past the end do not widen what those that bounce do, and the other way round."""
+    sigmas, surfaces = np.array([0.005] * 3 + [0.2] * 3 + [5.0] * 3), Surfaces(0.0, -0.76, (-2.0, end, -0.7, 0.7))
+    ball = BallState(3.0, FALLING, np.diag(sigmas**2), (), World(world.model, surfaces, NEARLY_EXACT))
+    first = torch.from_numpy(FALLING + sigmas * np.random.default_rng(3).standard_normal((DRAWS // 4, 9)))
+    times = torch.linspace(0.001, 0.7, 700, dtype=torch.float64)
+    later, plane = rollout(world.model, first, times, surfaces).numpy(), Plane.parse(text)
+    found = ball.predict(0.7).event(plane).crossing
+    if found is None:
+        assert plane.after or plane.direction == ("down" if end == 0.7 else "up")
+        return
+    (normal, offset), bounced = plane.line, np.cumsum(np.diff(later[..., VZ], axis=1, prepend=-9.0) > 0.1, axis=1) > 1
+    above = later[..., POSITION] @ normal > offset
+    crosses = (above[:, 1:] != above[:, :-1]) & (bounced[:, :-1] | (plane.after == 0))
+    if plane.direction != "either":
+        crosses &= above[:, 1:] == (plane.direction == "up")
+    rows = np.flatnonzero(crosses.any(axis=1))
+    at = crosses[rows].argmax(axis=1)
+    about = np.sqrt(np.square(later[rows, at] - found.state).mean(axis=0))[3:6]
+    assert np.sqrt(np.diagonal(found.covariance))[3:6] == pytest.approx(about, rel=0.25, abs=0.02)
+    assert found.time_sigma == pytest.approx(np.sqrt(np.square(times.numpy()[at] + 3.0 - found.time).mean()), rel=0.2)
+
+
 VAGUE = np.array([0.01, 0.01, 0.02, 0.1, 0.1, 0.1, 20.0, 20.0, 20.0])
 
 
