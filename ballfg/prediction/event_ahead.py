@@ -36,6 +36,7 @@ SPANS: Final = 6  # Number of parts of the horizon in which a possible ball has 
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce
+TOP: Final = np.eye(STATE_DIM)[VZ]  # An apex is a fall of this line (9,) . state through zero
 Carried: TypeAlias = tuple[Propagator, Belief]
 
 
@@ -59,9 +60,9 @@ def asked_event(text: str) -> Plane | str:
 def event_on(path: "Path", asked: Plane | str) -> EventAhead:
     """The first event of a kind on a path; asked: as from `asked_event`."""
     if isinstance(asked, Plane):
-        return _crossing(path, asked)
+        return EventAhead(path.crossing(asked), path.probability(*_line_of(asked), asked.direction, asked.after))
     if asked == APEX:
-        return EventAhead(apex(*path.carried, path.horizon), path.probability(np.eye(STATE_DIM)[VZ], 0.0, "down"))
+        return EventAhead(path.apex(), path.probability(TOP, 0.0, "down"))
     return EventAhead(*contact_ahead(path.start, path.carried, path.horizon))
 
 
@@ -80,8 +81,8 @@ def contact_ahead(start: "BallState", carried: Carried, horizon: float) -> tuple
     """The next contact within a horizon, s, and the probability that there is one.
 
     While the state is in doubt whether the ball has bounced just now, a ball on the other side has another contact: the
-    bounce itself, or the one after it. The numbers of the mean's contact then spread to that one too. Likewise to the
-    contacts of balls that pass an end of the table on the other side than the mean.
+    bounce itself, or the one after it. So has one that passes an end of the table on the other side than the mean. The
+    numbers of the mean's contact then spread to those too.
     """
     found, end = next_contact(*carried, horizon + LATER), start.time + horizon
     chance = 0.0 if found is None else _sooner(found, end - found.time)
@@ -214,24 +215,43 @@ class Path:
         return Scattered.of(belief.model, start, h, chance, surfaces)
 
     def crossing(self, plane: Plane) -> Crossing | None:
-        """The crossing of a plane by the mean ball, with the covariance of all balls about it that have one.
-
-        Near a bounce some cross it before and others after; by an end of the table some meet it and others do not.
-        """
+        """The crossing of a plane by the mean ball, with the covariance of all balls about it that have one."""
         found = crossing_of(self.carried, plane, self.horizon)
-        if found is None:
-            return None
-        speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
-        about = FAR * (found.time_sigma + math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed)
-        by_an_end, since = self._by_an_end(found.time), found.time - about
-        if not by_an_end:
-            contact = next_contact(*self.carried, self.horizon + LATER, after=since)
-            if contact is None or contact.time > found.time + about:
-                return found
-        times, states, met = self._crossings(plane)
-        if len(met) == 0 or not (by_an_end or (met != met[0]).any()):
+        return None if found is None else self._of_all(found, *_line_of(plane), plane.direction, plane.after)
+
+    def apex(self) -> Crossing | None:
+        """The next highest point of the mean ball, with the covariance of all balls about it that have one."""
+        found = apex(*self.carried, self.horizon)
+        return None if found is None else self._of_all(found, TOP, 0.0, "down", 0)
+
+    def _of_all(self, found: Crossing, line: Array, offset: float, direction: str, after: int) -> Crossing:
+        """The mean's event, with the moments of possible balls where these are not its neighbours.
+
+        Near a bounce some have it before and others after; some have had it just now, and have it again later or in
+        the other direction; by an end of the table some meet the table and others do not.
+        """
+        apart = self._just_now(line, offset) or self._by_an_end(found.time)
+        if not (apart or self._near_a_bounce(found, line)):
+            return found
+        times, states, met = self._events(line, offset, direction, after)
+        if len(met) == 0 or not (apart or (met != met[0]).any()):
             return found
         return _spread_over(found, states, times - (found.time - self.start.time))
+
+    def _just_now(self, line: Array, offset: float) -> bool:
+        """Whether some balls may be on the other side of an event than the mean at the start."""
+        belief, own = self.carried[1], slice(STATE_DIM)  # without the other side of a contact
+        variance = line @ belief.covariance[0, own, own].detach().numpy() @ line
+        return bool(abs(line @ self.start.state - offset) < FAR * math.sqrt(max(variance, 0.0)))
+
+    def _near_a_bounce(self, found: Crossing, line: Array) -> bool:
+        """Whether some balls may have bounced at an event, and others not."""
+        about = FAR * found.time_sigma
+        if not line[VZ]:
+            speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
+            about += FAR * math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed
+        contact = next_contact(*self.carried, self.horizon + LATER, after=found.time - about)
+        return contact is not None and contact.time <= found.time + about
 
     def _by_an_end(self, until: float) -> bool:
         """Whether the mean's contacts up to a time (s), or its fall past the table then, may be another ball's not."""
@@ -245,16 +265,15 @@ class Path:
             since = time
         return False
 
-    def _crossings(self, plane: Plane) -> tuple[Array, Array, Array]:
-        """Times (m,) s since the start, states (m, 9) and numbers of bounces (m,) of the balls that cross a plane."""
-        (line, offset), balls = _line_of(plane), self.possible
-        above = balls.states @ line > offset
-        crossed = (above[:, :-1] != above[:, 1:]) & (balls.met[:, :-1] >= plane.after)
-        if plane.direction != "either":
-            crossed &= above[:, :-1] == (plane.direction == "down")
+    def _events(self, line: Array, offset: float, direction: str, after: int) -> tuple[Array, Array, Array]:
+        """Times (m,) s since the start, states (m, 9) and numbers of bounces (m,) of the balls that have an event."""
+        balls, above = self.possible, self.possible.states @ line > offset
+        crossed = (above[:, :-1] != above[:, 1:]) & (balls.met[:, :-1] >= after)
+        if direction != "either":
+            crossed &= above[:, :-1] == (direction == "down")
         rows = np.flatnonzero(crossed.any(axis=1))
         at = crossed[rows].argmax(axis=1)
-        times, states = balls.crossed(rows, at, line[POSITION], offset)
+        times, states = balls.topped(rows, at) if line[VZ] else balls.crossed(rows, at, line[POSITION], offset)
         return times, states, balls.met[rows, at]
 
     def probability(self, line: Array, offset: float, direction: str, after: int = 0) -> float:
@@ -267,22 +286,15 @@ class Path:
         values = np.empty((len(value), 2 * value.shape[1] - 1))
         values[:, ::2], values[:, 1::2] = value, value[:, :-1] + turn
         counts = np.repeat(balls.met >= after, 2, axis=1)[:, :-1]
-        above, below = (values > 0.0) & counts, (values < 0.0) & counts
+        first, then = (values > 0.0) & counts, (values < 0.0) & counts
         if direction == "either":
-            return float((above.any(axis=1) & below.any(axis=1)).mean())
-        first, then = (above, below) if direction == "down" else (below, above)
+            return float((first.any(axis=1) & then.any(axis=1)).mean())
+        first, then = (then, first) if direction == "up" else (first, then)
         return float((np.maximum.accumulate(first, axis=1) & then).any(axis=1).mean())
-
-
-def _crossing(path: Path, plane: Plane) -> EventAhead:
-    """The crossing of a plane, after its number of bounces."""
-    line, offset = _line_of(plane)
-    return EventAhead(path.crossing(plane), path.probability(line, offset, plane.direction, plane.after))
 
 
 def _line_of(plane: Plane) -> tuple[Array, float]:
     """Line (9,) and offset of a plane: a ball is on it where line . state is the offset."""
-    normal, offset = plane.line
-    line = np.zeros(STATE_DIM)
+    line, (normal, offset) = np.zeros(STATE_DIM), plane.line
     line[POSITION] = normal
     return line, offset

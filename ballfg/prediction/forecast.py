@@ -10,7 +10,7 @@ from ballfg.arrays import Array
 from ballfg.checks import check_number, check_text
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
-from ballfg.prediction.crossing import Crossing, apex
+from ballfg.prediction.crossing import Crossing
 from ballfg.prediction.event_ahead import Carried, EventAhead, Path, asked_event, contact_ahead, event_on
 from ballfg.prediction.plane import AXES, Plane
 from ballfg.prediction.propagate import Propagator
@@ -71,8 +71,11 @@ class Forecast:
 
     @cached_property
     def apex(self) -> Crossing | None:
-        """The next highest point; None if there is none within the horizon."""
-        return apex(*self._carried, self.horizon)
+        """The next highest point; None if there is none within the horizon.
+
+        Where some balls may be past it just now, the covariance holds those and their next one.
+        """
+        return self._path.apex()
 
     def crossing(
         self,

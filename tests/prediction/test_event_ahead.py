@@ -305,6 +305,37 @@ def test_a_crossing_by_the_end_of_a_table_is_that_of_the_balls_that_have_one(wor
     assert found.time_sigma == pytest.approx(np.sqrt(np.square(times.numpy()[at] + 3.0 - found.time).mean()), rel=0.2)
 
 
+@pytest.mark.parametrize("rising", [0.35, 0.2, 0.05, -0.05, -0.2])
+@pytest.mark.parametrize("text", ["apex", "z=0.15", "z=0.15,down"])
+def test_an_event_that_may_just_have_been_is_in_doubt(world, text, rising):
+    """Some balls are at their highest point now, the others after the next bounce; some are above the plane."""
+    mean, sigmas = (
+        np.array([0.0, 0.0, 0.15, 3.0, 0.0, rising, 0.0, 0.0, 0.0]),
+        np.array([0.002] * 3 + [0.2] * 3 + [5.0] * 3),
+    )
+    ball = BallState(3.0, mean, np.diag(sigmas**2), (), World(world.model, Surfaces(0.0), NEARLY_EXACT))
+    first = torch.from_numpy(mean + sigmas * np.random.default_rng(3).standard_normal((DRAWS // 4, 9)))
+    times = torch.linspace(0.001, 0.7, 700, dtype=torch.float64)
+    later = np.concatenate((first.numpy()[:, None], rollout(world.model, first, times, Surfaces(0.0)).numpy()), axis=1)
+    value = later[..., VZ] if text == "apex" else later[..., 2] - 0.15
+    passes = (value[:, :-1] > 0.0) & (value[:, 1:] <= 0.0)
+    if text == "z=0.15":
+        passes |= (value[:, :-1] < 0.0) & (value[:, 1:] >= 0.0)
+    rows = np.flatnonzero(passes.any(axis=1))
+    at = passes[rows].argmax(axis=1)
+    told = ball.predict(0.7).event(text)
+    assert told.probability == pytest.approx(len(rows) / len(first), abs=0.06)
+    if told.crossing is None:
+        assert text != "apex"
+        assert rising < 0.0
+        return
+    assert told.crossing.time_sigma == pytest.approx(
+        np.sqrt(np.square(0.001 * at + 3.0 - told.crossing.time).mean()), rel=0.2
+    )
+    about = np.sqrt(np.square(later[rows, at] - told.crossing.state).mean(axis=0))[[0, 2, 3, 5]]
+    assert np.sqrt(np.diagonal(told.crossing.covariance))[[0, 2, 3, 5]] == pytest.approx(about, rel=0.2, abs=6e-3)
+
+
 VAGUE = np.array([0.01, 0.01, 0.02, 0.1, 0.1, 0.1, 20.0, 20.0, 20.0])
 
 

@@ -17,7 +17,7 @@ from ballfg.dynamics.compiled.roll_out import crossed_by_all, scatter
 from ballfg.dynamics.compiled.signatures import GIVEN
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import STATE_DIM, Z
+from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
 
 ENDS: Final = slice(3, 7)  # Of a world for machine code: the ends of the table
 
@@ -181,6 +181,24 @@ class Scattered:
         h, times, states = self.times[rows, at + 1] - self.times[rows, at], np.empty(len(rows)), self.states[rows, at]
         crossed_by_all(states.copy(), self.states[rows, at + 1], h, normal, offset, times, states)
         return self.times[rows, at] + times, states
+
+    def topped(self, rows: Index, at: Index) -> tuple[Array, Array]:
+        """Times (m,) s since the start and states (m, 9) at the highest points of balls that rise, then fall.
+
+        Args: rows: (m,) balls.  at: (m,) moments before, with the next one in the same flight.
+        """
+        x, after, h = self.states[rows, at], self.states[rows, at + 1], self.times[rows, at + 1] - self.times[rows, at]
+        rise, slope, last = (
+            after[:, POSITION] - x[:, POSITION],
+            h[:, None] * x[:, VELOCITY],
+            h[:, None] * after[:, VELOCITY],
+        )
+        bend, twist = 3.0 * rise - 2.0 * slope - last, slope + last - 2.0 * rise  # p + slope s + bend s^2 + twist s^3
+        share = slope[:, 2] / (np.sqrt(bend[:, 2] ** 2 - 3.0 * twist[:, 2] * slope[:, 2]) - bend[:, 2])
+        s, states = share[:, None], x + share[:, None] * (after - x)
+        states[:, POSITION] = x[:, POSITION] + s * (slope + s * (bend + s * twist))
+        states[:, VELOCITY] = (slope + s * (2.0 * bend + 3.0 * s * twist)) / h[:, None]
+        return self.times[rows, at] + share * h, states
 
 
 def density_of(noise: Any) -> Array:
