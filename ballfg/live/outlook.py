@@ -15,9 +15,9 @@ from ballfg.estimation.result import Status
 from ballfg.live.tracker import BallUpdate
 from ballfg.prediction import BallState, apex
 from ballfg.prediction.crossing import Crossing
-from ballfg.prediction.event_ahead import APEX, CONTACT, EventAhead, Path, contact_ahead, event_on
+from ballfg.prediction.event_ahead import EventAhead, Path, contact_ahead, event_on
 from ballfg.prediction.forecast import carried_by
-from ballfg.prediction.plane import Plane
+from ballfg.prediction.plane import APEX, CONTACT, Plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 VAGUE = 3.0  # m/s, standard deviation of the velocity beyond which predictions carry no information

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
 from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
@@ -22,14 +21,13 @@ from ballfg.dynamics.motion.rollout import is_resting, place_on
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief, normal_points, root_of
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
-from ballfg.prediction.plane import AXES, Plane
+from ballfg.prediction.plane import APEX, AXES, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
     from ballfg.prediction.state import BallState
 
-APEX, CONTACT = "apex", "next-contact"
 PAIRS: Final = 64  # Least number of pairs of possible balls, opposite about the mean; shares are right to some 0.03
 STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is right to 0.2 mm after one
 SPANS: Final = 6  # Number of parts of the horizon in which a possible ball has a random acceleration each
@@ -48,19 +46,10 @@ class EventAhead:
     probability: float
 
 
-def asked_event(text: str) -> Plane | str:
-    """The plane of a text, or `apex` or `next-contact` as they are. Raises: ValueError: any other text."""
-    if text in (APEX, CONTACT):
-        return text
-    if "=" not in text:
-        raise ValueError(f"event must be {APEX}, {CONTACT} or a plane such as z=3.05,down; got {shown(text)}")
-    return Plane.parse(text)
-
-
 def event_on(path: "Path", asked: Plane | str) -> EventAhead:
     """The first event of a kind on a path; asked: as from `asked_event`."""
     if isinstance(asked, Plane):
-        return EventAhead(path.crossing(asked), path.probability(*_line_of(asked), asked.direction, asked.after))
+        return EventAhead(path.crossing(asked), _chance_of(path, asked))
     if asked == APEX:
         return EventAhead(path.apex(), path.probability(TOP, 0.0, "down"))
     return EventAhead(*contact_ahead(path.start, path.carried, path.horizon))
@@ -114,9 +103,8 @@ def _past_or_not(
     """The mean's contact and its probability; from possible balls if these differ in the surface that they meet."""
     balls, heights = Path(start, carried, horizon + LATER).possible, carried[0].surfaces.heights()
     bounces = np.diff(balls.met, axis=1) > 0.0
-    rows = np.flatnonzero(bounces.any(axis=1))
-    at = bounces[rows].argmax(axis=1)
-    states, times = balls.states[rows, at], balls.times[rows, at]
+    rows, at = np.flatnonzero(bounces.any(axis=1)), bounces.argmax(axis=1)
+    states, times = balls.states[rows, at[rows]], balls.times[rows, at[rows]]
     upper = int((states[:, Z] > sum(heights) / len(heights)).sum())
     if len(rows) == len(bounces) and upper in (0, len(rows)):
         return mean
@@ -158,6 +146,18 @@ def _other_contact(
         other = Crossing(start.time, 0.0, before[0, :STATE_DIM].numpy(), start.covariance)
     jump = float(belief.model.after_bounce(before)[0, VZ] - before[0, VZ])
     return min(variance / jump**2, MOST), other
+
+
+def _chance_of(path: "Path", plane: Plane) -> float:
+    """The probability of a crossing; on the other side of a present bounce a ball has one more ahead, or one less."""
+    asked = (*_line_of(plane), plane.direction)
+    chance = path.probability(*asked, plane.after)
+    if not plane.after or path.start.other_side is None:
+        return chance
+    found = next_contact(*path.carried, path.horizon + LATER)
+    share, _ = _other_contact(path.start, path.carried, found, path.horizon)
+    other = path.probability(*asked, plane.after + (-1 if path.start.state[VZ] > 0.0 else 1))
+    return chance + share * (other - chance)
 
 
 def event_numbers(found: Crossing | None) -> dict[str, float]:

@@ -11,6 +11,7 @@ from ballfg.arrays import Array
 from ballfg.checks import check_array, check_choice, check_count, check_number, shown
 
 AXES: Final = ("x", "y", "z")
+APEX, CONTACT = "apex", "next-contact"
 DIRECTIONS: Final = ("either", "up", "down")
 MOST_BOUNCES: Final = 20  # Largest number of bounces before a crossing: after so many a ball rolls
 
@@ -83,3 +84,12 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
+
+
+def asked_event(text: str) -> Plane | str:
+    """The plane of a text, or `apex` or `next-contact` as they are. Raises: ValueError: any other text."""
+    if text in (APEX, CONTACT):
+        return text
+    if "=" not in text:
+        raise ValueError(f"event must be {APEX}, {CONTACT} or a plane such as z=3.05,down; got {shown(text)}")
+    return Plane.parse(text)

@@ -22,9 +22,8 @@ import ballfg as bf
 from ballfg.arrays import Array
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.configure import dataset_surfaces, fitted_settings
-from ballfg.prediction.event_ahead import APEX, CONTACT
 from ballfg.prediction.forecast import Forecast
-from ballfg.prediction.plane import Plane
+from ballfg.prediction.plane import APEX, CONTACT, Plane
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig
 from ballfg.simulation.synthetic import dataset_info, simulate
 from ballfg.state import POSITION, VZ

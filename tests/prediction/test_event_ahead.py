@@ -419,6 +419,22 @@ def test_the_next_contact_is_in_doubt_with_the_present_one(world, bounced):
     assert (soon.next_contact is None) == bounced
 
 
+@pytest.mark.parametrize("bounced", [False, True])
+def test_bounces_before_a_crossing_are_in_doubt_with_the_present_one(world, bounced):
+    """A ball that has just bounced needs another bounce; with a chance of 0.2 it is the other way round."""
+    share, falling = 0.2, torch.tensor([[0.0, 0.0, 0.0205, 3.0, 0.0, -3.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    risen = world.model.after_bounce(falling)
+    own, other = (risen, falling) if bounced else (falling, risen)
+    jump = np.zeros(9)
+    jump[VZ] = float((other - own)[0, VZ])
+    doubt = share * np.outer(jump, jump)
+    torn = BallState(5.0, own[0].numpy(), 1e-6 * np.eye(9) + doubt, (), world, other_side=doubt)
+    rises, again = torn.predict(0.2).event("z=0.1,up,after=1"), torn.predict(0.9).event("z=0.1,up,after=2")
+    assert rises.probability == pytest.approx(share if bounced else 1.0 - share, abs=0.01)
+    assert again.probability == pytest.approx(share if bounced else 1.0 - share, abs=0.01)
+    assert torn.predict(0.2).event("z=0.1,up").probability == 1.0
+
+
 def test_numbers_of_an_event_are_those_of_its_state(start):
     found = start.predict(HORIZON).next_contact
     numbers = event_numbers(found)

@@ -92,7 +92,7 @@ def predict(
     from ballfg.estimation import predict_tracks
     from ballfg.estimation.track_prediction import check_observe
     from ballfg.files.whole_file import check_file
-    from ballfg.prediction.event_ahead import APEX, CONTACT, asked_event
+    from ballfg.prediction.plane import APEX, CONTACT, asked_event
     from ballfg.tracks import TableWriter
 
     outcome = _Outcome()
