@@ -13,7 +13,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
 from ballfg.live.tracker import BallUpdate
-from ballfg.prediction import BallState, apex
+from ballfg.prediction import BallState
 from ballfg.prediction.crossing import Crossing
 from ballfg.prediction.event_ahead import EventAhead, Path, contact_ahead, event_on
 from ballfg.prediction.forecast import carried_by
@@ -61,14 +61,14 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
 
 
 def _finders(state: OnlineState, horizon: float, plane: Plane | None) -> dict[str, Callable[[], EventAhead]]:
-    """What finds each event. Probabilities need possible balls, which are moved only where a plane is asked for."""
+    """What finds each event. Probabilities always need possible balls, so they are given where a plane is asked for."""
     carried = carried_by(state)
+    path = Path(state, carried, horizon)
     if plane is None:
         return {
             "bounce": lambda: EventAhead(*contact_ahead(state, carried, horizon)),
-            "apex": lambda: EventAhead(apex(*carried, horizon), math.nan),
+            "apex": lambda: EventAhead(path.apex(), math.nan),
         }
-    path = Path(state, carried, horizon)
     asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}
     return {what: partial(event_on, path, event) for what, event in asked.items()}
 

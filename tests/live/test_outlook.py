@@ -11,6 +11,7 @@ from ballfg.estimation import Online, Status
 from ballfg.estimation.online.state import OnlineState
 from ballfg.live.outlook import look_out
 from ballfg.prediction.plane import Plane
+from ballfg.state import VZ
 from tests.live.shots import SURFACES, ball_model, ball_settings, shots
 
 
@@ -30,6 +31,18 @@ def test_events_are_those_of_the_prediction(state: OnlineState) -> None:
         np.testing.assert_allclose(mine.state, theirs.state, atol=1e-9)
     assert (seen.apex is None) == (ahead.apex is None)
     assert look_out(state, 0.01, Plane.parse("x=50")).crossing is None
+
+
+@pytest.mark.parametrize("plane", [None, Plane.parse("x=1.5")])
+def test_an_apex_that_may_just_have_been_is_that_of_the_prediction(state: OnlineState, plane: Plane | None) -> None:
+    mean, joint = state.mean.copy(), state.joint.copy()
+    mean[VZ], joint[VZ, VZ] = 0.1, 0.04
+    doubtful = replace(state, mean=mean, joint=joint)
+    ahead, seen = doubtful.predict(0.8).apex, look_out(doubtful, 0.8, plane).apex
+    assert ahead is not None
+    assert seen is not None
+    assert seen.time_sigma == ahead.time_sigma > 0.05
+    np.testing.assert_array_equal(seen.covariance, ahead.covariance)
 
 
 @pytest.mark.parametrize("plane", ["x=1.5", "z=0.9,down", "z=0.9,up,after=1", "x=50"])
