@@ -1,4 +1,4 @@
-"""Finds samples near a contact at which a ball may be on either side, the states to report, and covariances."""
+"""Finds samples near a contact or hit where a ball may be on either side, the states to report, and covariances."""
 
 import copy
 import math
@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through, gap_jacobian
 from ballfg.estimation.plausible import possible
@@ -18,7 +18,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisModel, SampleMeasurement
 from ballfg.factors.linear.definite import compatible, definite, variances_positive
-from ballfg.state import STATE_DIM, VZ
+from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ
 
 NEGLIGIBLE: Final = 1e-6
 """Probability below which a side is neglected."""
@@ -34,7 +34,7 @@ GATE: Final = 30.664849
 FAR: Final = 4.0
 """Standard deviations of a contact's time beyond which a stamp lies on one side of it."""
 LEAST_SPEED: Final = 1e-3
-"""m/s, least vertical speed in the uncertainty of a contact's time."""
+"""m/s, least speed across the surface, or jump of the velocity, in the uncertainty of the time of a contact or hit."""
 MORE: Final = 3.0
 """Factor on the chance of the less probable side in a covariance,"""
 ENOUGH: Final = 0.3
@@ -70,13 +70,18 @@ class Shared:
     cross: Array
 
 
-def widened_near_contacts(estimate: Estimate, model: BallModel) -> Estimate:
-    """The estimate with covariances widened for the chance of the other side of a near contact."""
+def widened_near_contacts(estimate: Estimate, model: BallModel, restarts: Sequence[int] | Index = ()) -> Estimate:
+    """The estimate with covariances widened for the chance of the other side of a near contact or hit.
+
+    Args: restarts: those of the hits over which nothing links the two sides.
+    """
     if estimate.status.failed:  # its states have no contacts
         return replace(estimate, other_sides=np.zeros_like(estimate.covariances))
     shared = Shared(estimate.coefficients, estimate.coefficient_covariance, estimate.cross_covariances)
     known = (estimate.times, estimate.states, estimate.covariances, estimate.contacts)
     others = widening_near_contacts(*known, model, shared)
+    struck = np.setdiff1d(estimate.hits, [*restarts, *(contact.interval for contact in estimate.contacts)])
+    others += widening_near_hits(*known[:3], struck, model, shared)
     return replace(estimate, covariances=estimate.covariances + others, other_sides=others)
 
 
@@ -107,6 +112,60 @@ def widening_near_contacts(
             other = 2 * met[0].interval + 1 - k
             lacking[k] += widening(covariances[k], covariances[other], there - states[k], chance)
     return lacking
+
+
+def widening_near_hits(
+    times: Array, states: Array, covariances: Array, hits: Index, model: BallModel, shared: Shared
+) -> Array:
+    """(n, 9, 9) to be added next to hits for the chance that a ball is on the other side; zero elsewhere.
+
+    A hit is where the paths before and after it meet. Its time is known to the sigma of their distance over the jump of
+    the velocity; where they miss each other by more than that sigma, the miss takes its place.
+
+    Args: times, states, covariances: (n,) s, (n, 9), (n, 9, 9).  hits: (h,) intervals without a contact.
+        model: the ball, its coefficients in columns after the state.
+    """
+    lacking, width = np.zeros_like(covariances), POSITION.stop + 3
+    if not len(hits):
+        return lacking
+    spans = times[hits + 1] - times[hits]
+    there, lags, misses = across_hits(model, times, states, shared.mean, hits)
+    for late in (0, 1):
+        near, far = hits + late, hits + 1 - late
+        step = np.tile(np.eye(3, width), (len(hits), 1, 1))
+        step[:, :, VELOCITY] = (spans * (1 if late else -1))[:, None, None] * np.eye(3)
+        spread = covariances[near][:, POSITION, POSITION] + step @ covariances[far][:, :width, :width] @ step.mT
+        jump = there[:, late, VELOCITY] - states[near, VELOCITY]
+        speeds = np.maximum(np.linalg.norm(jump, axis=1), LEAST_SPEED)
+        along = np.einsum("hi,hij,hj->h", jump, spread, jump) / speeds**2
+        sigmas = np.sqrt(np.maximum(along, 0.5 * (misses**2).sum(axis=1)))  # a miss has two components
+        margins = np.where(late, spans - lags, lags) * speeds / sigmas
+        for row in np.flatnonzero(margins < FAR):
+            k = near[row]
+            if possible(there[row, late]):
+                chance = 0.5 * math.erfc(max(float(margins[row]), 0.0) / math.sqrt(2.0))
+                lacking[k] += widening(covariances[k], covariances[far[row]], there[row, late] - states[k], chance)
+    return lacking
+
+
+def across_hits(
+    model: BallModel, times: Array, states: Array, coefficients: Array, hits: Index
+) -> tuple[Array, Array, Array]:
+    """States of a ball if hits lay beyond the ends of their intervals, and where the paths before and after them meet.
+
+    Args: times, states: (n,) s, (n, 9).  coefficients: (p,) in columns after the state.  hits: (h,) intervals.
+    Returns: (h, 2, 9) states at both ends; (h,) s from the start of the interval to where the paths are nearest to each
+        other, and (h, 3) m between them there.
+    """
+    spans = times[hits + 1] - times[hits]
+    starts = _with_coefficients(states[np.stack((hits + 1, hits), axis=1).ravel()], coefficients)
+    with torch.no_grad():
+        flown, _ = fly_through(model, starts, torch.from_numpy(np.stack((-spans, spans), axis=1).ravel()), ())
+    there = flown[:, :STATE_DIM].numpy().reshape(-1, 2, STATE_DIM)
+    apart = there[:, 0] - states[hits]
+    jump = apart[:, VELOCITY]
+    lags = -(apart[:, POSITION] * jump).sum(axis=1) / np.maximum((jump**2).sum(axis=1), LEAST_SPEED**2)
+    return there, lags, apart[:, POSITION] + lags[:, None] * jump
 
 
 def gap_sigmas(

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,8 +11,11 @@ from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import steps_over_each
 from ballfg.estimation.segmentation.result import Contact, Segmentation
-from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
+from ballfg.estimation.sides.monitor import across_hits
+from ballfg.factors.batch import Values
+from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors, model_width
 from ballfg.factors.noise import Kicks, ProcessNoise
+from ballfg.state import VELOCITY
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,8 @@ class Motion:
 
 
 FLIGHT = Motion()
+LEAST_SIDE = 3
+"""Samples before and after a hit without which their paths do not show where they meet."""
 KICK_PARTS = 64
 """Parts of an interval to which contact times are rounded for the process noise. With finer ones an estimate would
 depend on the rounding of a segmentation, which knows the axes of the frame: with these parts it turns with the data."""
@@ -85,6 +90,52 @@ def contacts_by_interval(contacts: tuple[Contact, ...]) -> dict[int, list[Contac
     for contact in sorted(contacts, key=lambda c: (c.interval, c.time)):
         found.setdefault(contact.interval, []).append(contact)
     return found
+
+
+def with_moved_hits(
+    found: Segmentation, contacts: Sequence[Contact], times: Array, values: Values, model: BallModel, noise: float
+) -> Segmentation:
+    """A segmentation, each hit moved by one interval to where the estimated paths before and after it meet.
+
+    A hit stays where too few samples show these paths, at another event, and at a stamp so near that the noise of a
+    sample hides on which side of it the hit was: the covariances hold both.
+
+    Args: found: with the hits of `values`.  contacts: refined.  times: (n,) s.  values: estimated.
+        noise: m, standard deviation of a sample.
+    """
+    if not len(found.hits):
+        return found
+    still = {contact.interval for contact in contacts} | set(found.restarts.tolist())
+    taken = still | set(found.hits.tolist())
+    for rest in found.rests:
+        taken |= set(range(rest.first, rest.last + 1))
+    there, lags, _ = across_hits(model, times, values.states, values.coefficients[: model_width(model)], found.hits)
+    jumps = np.linalg.norm(there[:, 0, VELOCITY] - values.states[found.hits, VELOCITY], axis=1)
+    ways, slack = lags * jumps, np.diff(times)[found.hits] * jumps + noise
+    late = (ways > slack).astype(int) - (ways < -noise)
+    ends = [-1, *found.hits.tolist(), len(times) - 1]
+    hits = [
+        hit + step
+        if step
+        and hit not in still
+        and hit + step not in taken
+        and before + LEAST_SIDE <= hit + step <= after - LEAST_SIDE
+        else hit
+        for before, hit, after, step in zip(ends, ends[1:-1], ends[2:], late.tolist(), strict=False)
+    ]
+    return found if hits == ends[1:-1] else replace(found, hits=np.array(hits, dtype=np.int64))
+
+
+def move_hits(values: Values, times: Array, old: Index, new: Index, model: BallModel) -> Values:
+    """Values for a continued search after hits moved from intervals to neighbours, (h,) each, of samples at (n,) s."""
+    if np.array_equal(old, new):
+        return values
+    states = values.states.copy()
+    there, _, _ = across_hits(model, times, states, values.coefficients[: model_width(model)], old)
+    for row in np.flatnonzero(new != old):
+        late = int(new[row] > old[row])
+        states[old[row] + late] = there[row, late]
+    return replace(values, states=states)
 
 
 class TrackDynamics:

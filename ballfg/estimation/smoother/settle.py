@@ -1,6 +1,6 @@
 """Starts the search for a minimum, arranges its contacts, and starts it again where it went wrong.
 
-A minimum is found for one arrangement of contacts. Contacts whose estimated time lies outside of their interval then
+A minimum is found for one arrangement of contacts and hits. Those whose estimated time lies outside of their interval
 move, and the next minimum is computed, until they stay; the lowest minimum is the result.
 
 Cauchy's loss lets go. From a rough start a spin may move so far from its label that it hardly pulls any more; the
@@ -11,7 +11,7 @@ search starts again; the lower minimum is the result.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.sides.monitor import FAR, LEAST_SPEED, Shared, gap_sigmas
-from ballfg.estimation.smoother.motion import contacts_by_interval
+from ballfg.estimation.smoother.motion import contacts_by_interval, move_hits, with_moved_hits
 from ballfg.estimation.smoother.problem import Events, TrackProblem, bridged_positions
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.correlated_noise import BiasStartFactors
@@ -50,10 +50,12 @@ LEAST_FALL = 0.05
 DEAR = 5.0
 """Of the objective, a log likelihood: gain of a contact that only the end of a track suggests, if one camera saw it."""
 MAX_REFINEMENTS = 6
-"""Largest number of moves of contacts to a neighbouring interval; measured tracks needed two."""
+"""Largest number of moves of contacts and hits to a neighbouring interval; measured tracks needed two."""
 LABELS = (LauncherSpinFactors, SpinLabelFactors)
 """Factors of a spin known before the flight. A few of many sightings are far off as a matter of course; a track's
 single label is not."""
+Arrangement: TypeAlias = tuple[tuple[tuple[int, float], ...], tuple[int, ...]]
+"""Interval and height of each contact, and the intervals of hits."""
 
 
 @dataclass(frozen=True)
@@ -120,26 +122,29 @@ def initial_states(
 
 
 class ContactSearch:
-    """The arrangements of a track's contacts, beginning with its segmentation."""
+    """The arrangements of a track's contacts and hits, beginning with its segmentation."""
 
-    def __init__(self, problem: TrackProblem, surfaces: Surfaces, segmentation: Segmentation) -> None:
-        self.problem, self.surfaces, self.segmentation = problem, surfaces, segmentation
-        self._seen: dict[tuple[tuple[int, float], ...], Solution] = {}
+    def __init__(self, problem: TrackProblem, surfaces: Surfaces) -> None:
+        self.problem, self.surfaces = problem, surfaces
+        self._seen: dict[Arrangement, Solution] = {}
         self._settled: Solution | None = None
         self._best: Solution | None = None
 
     @property
     def best(self) -> Solution:
-        """The lowest minimum so far; among those with consistent contacts, if any."""
+        """The lowest minimum so far; among those with consistent contacts and hits, if any."""
         return min(self._seen.values(), key=lambda s: s.minimum.error) if self._best is None else self._best
 
     def after(self, solution: Solution) -> tuple[Events, Values] | None:
         """The next arrangement with initial values, after a solution for the previous one; None at the end."""
         times, ball = self.problem.track.times, self.problem.ball
-        places = places_of(solution.events.contacts)
-        self._seen[places] = solution
-        refined = refined_contacts(times, solution)
-        if places_of(refined) == places:
+        events = solution.events
+        here = arrangement_of(events)
+        self._seen[here] = solution
+        contacts, values = refined_contacts(times, solution), solution.minimum.values
+        noise = float(np.median(self.problem.sigma))
+        refined = Events(contacts, with_moved_hits(events.segmentation, contacts, times, values, ball, noise))
+        if arrangement_of(refined) == here:
             sided = self._sided(solution)
             if sided is not None:
                 return sided
@@ -150,11 +155,12 @@ class ContactSearch:
                 self._best = solution if more else self._settled
                 return None
             self._settled = solution
-            refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))
-        if places_of(refined) in self._seen or len(self._seen) == MAX_REFINEMENTS:
+            refined = replace(refined, contacts=tuple(sorted((*refined.contacts, *unseen), key=lambda c: c.time)))
+        if arrangement_of(refined) in self._seen or len(self._seen) == MAX_REFINEMENTS:
             return self._sided(self.best)
-        values = move_contacts(solution.minimum.values, times, places, places_of(refined), ball)
-        return Events(refined, self.segmentation), values
+        places = places_of(events.contacts), places_of(refined.contacts)
+        values = move_hits(values, times, events.segmentation.hits, refined.segmentation.hits, ball)
+        return refined, move_contacts(values, times, *places, ball)
 
     def _sided(self, solution: Solution) -> tuple[Events, Values] | None:
         """The same arrangement with measurements that a solution without them shows to be on one side of a contact."""
@@ -245,6 +251,11 @@ def move_contacts(
         if bool(after.isfinite().all()):
             states[interval + 1] = after[0, :STATE_DIM].numpy()
     return replace(values, states=states)
+
+
+def arrangement_of(events: Events) -> Arrangement:
+    """The places of contacts and of hits."""
+    return places_of(events.contacts), tuple(events.segmentation.hits.tolist())
 
 
 def places_of(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:

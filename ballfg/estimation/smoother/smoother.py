@@ -215,9 +215,9 @@ class Smoother(Estimator):
     def settle(self, problem: TrackProblem, earlier: Earlier | None = None) -> Solution:
         """The minimum with its events.
 
-        Contacts move to their estimated intervals; without a label that determines the spin, lower minima with another
-        spin are searched; if the motion still contradicts the model by far more than its noise, an unseen hit is added.
-        All this is decided at rough minima (`ROUGH`).
+        Contacts and hits move to their estimated intervals; without a label that determines the spin, lower minima with
+        another spin are searched; if the motion still contradicts the model by far more than its noise, an unseen hit
+        is added. All this is decided at rough minima (`ROUGH`).
 
         Args: problem: of a track.  earlier: information from before, if the track is the end of a longer one.
         """
@@ -229,7 +229,7 @@ class Smoother(Estimator):
             earlier = Earlier(near.minimum.values)
             segmentation = replace(near.events.segmentation, contacts=near.events.contacts)
         for left in range(MAX_UNSEEN_HITS if self.settings.find_events else 0, -1, -1):
-            search = ContactSearch(problem, self.surfaces, segmentation)
+            search = ContactSearch(problem, self.surfaces)
             if earlier is None:
                 label = problem.settings.spin_label(problem.track)
                 states = initial_states(problem.track, segmentation.contacts, segmentation, self.model, label)
@@ -246,6 +246,7 @@ class Smoother(Estimator):
                     minimum = minimise_with_restart(rough, graph, values, minimum)
                 arrangement = search.after(Solution(events, graph, minimum))
             solution = search.best
+            segmentation = solution.events.segmentation
             if (
                 earlier is None
                 and not spin_start(problem.settings.spin_label(problem.track), problem.settings).measured
@@ -346,7 +347,7 @@ class Smoother(Estimator):
             estimate = observation.judged(estimate)
         rival = rival_note(solution, estimate.covariances[0])
         estimate = replace(estimate, notes=estimate.notes + rival) if rival else estimate
-        return widened_near_contacts(estimate, problem.ball)
+        return widened_near_contacts(estimate, problem.ball, segmentation.restarts)
 
 
 class PiecewiseSmoother(Smoother):

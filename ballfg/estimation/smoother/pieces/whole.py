@@ -15,7 +15,7 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import sample_sigmas
-from ballfg.estimation.sides.monitor import Shared, widening_near_contacts
+from ballfg.estimation.sides.monitor import Shared, widening_near_contacts, widening_near_hits
 from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
 from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
 from ballfg.estimation.smoother.pieces.section import Section, State
@@ -82,6 +82,10 @@ def smoothed(smoother: "Smoother", task: tuple[State, Array, Point]) -> Smoothed
     cross = np.ascontiguousarray(known.cross[:, :STATE_DIM, own])
     shared = Shared(values.coefficients[own], known.coefficients[own, own], cross)
     sides = widening_near_contacts(times, values.states, covariances, contacts, problem.ball, shared)
+    events = section.events.segmentation
+    struck = np.setdiff1d(events.hits, [*events.restarts, *(c.interval + section.first for c in contacts)])
+    struck = struck[(struck >= section.first) & (struck < section.last)] - section.first
+    sides += widening_near_hits(times, values.states, covariances, struck, problem.ball, shared)
     near = np.flatnonzero(sides.any(axis=(1, 2)))
     # the covariance of its ends stands for the samples beyond them
     around = Covariances(section.padded(known.states), known.coefficients, section.padded(known.cross))
