@@ -1,18 +1,16 @@
 """Computes the final estimate of a streamed track: the window's minimum and the states that left the window."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ballfg.arrays import Array
-from ballfg.estimation.online.events import SIGMA_FACTOR
+from ballfg.arrays import Array, Index
+from ballfg.estimation.online.events import EventTracker
 from ballfg.estimation.online.state import Sample
-from ballfg.estimation.online.windows.interval import without_bias
 from ballfg.estimation.online.windows.stream_window import StreamWindow
-from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation.result import Contact, Segmentation
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.settle import Earlier
 from ballfg.estimation.smoother.smoother import Smoother
@@ -20,60 +18,96 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
 
-@dataclass(frozen=True)
-class Frozen:
-    """A state (9,) when it left the window: with its observation, and its covariance with the coefficients."""
+@dataclass(frozen=True, eq=False)
+class Leaving:
+    """Collects what is known of the states of a track when they leave the window.
 
-    sample: Sample
-    state: Array
-    joint: Array
+    Attributes: smoother: of the window's samples.  track: whose samples are pushed.  parts: estimates of all that left.
+    """
+
+    smoother: Smoother
+    track: Track
+    parts: list[Estimate] = field(default_factory=list)
+
+    def take(self, window: StreamWindow, events: EventTracker, count: int) -> None:
+        """Keeps the oldest states of the window, so many, as its minimum has them."""
+        self.parts.append(_oldest(self._minimum(window, events), count))
+
+    def lose(self, samples: Sequence[Sample], p: int) -> None:
+        """Keeps the states of samples as they are known without their window, which could not be solved.
+
+        Args: p: number of coefficients.
+        """
+        known = [unknown(sample, self.smoother.settings, p) for sample in samples]
+        n, own = len(samples), slice(STATE_DIM)
+        part = Estimate(
+            self.track.name,
+            np.array([sample.time for sample in samples]),
+            np.array([state for state, _ in known]).reshape(n, STATE_DIM),
+            np.array([joint[own, own] for _, joint in known]).reshape(n, STATE_DIM, STATE_DIM),
+            Status.NOT_CONVERGED,
+            cross_covariances=np.zeros((n, STATE_DIM, p)),
+            hits=np.flatnonzero([sample.motion.hit or not sample.motion.linked for sample in samples[1:]]),
+            quality=np.zeros(n, dtype=np.int8),
+            other_sides=np.zeros((n, STATE_DIM, STATE_DIM)),
+        )
+        self.parts.append(part)
+
+    def whole(self, window: StreamWindow, events: EventTracker) -> Estimate:
+        """The result over the whole track, from the window at its end and the states before it."""
+        late = self._minimum(window, events)
+        if not self.parts:
+            return late
+        parts, contacts, hits, begin = [*self.parts, late], list[Contact](), list[Index](), 0
+        for part in parts:
+            contacts += [replace(contact, interval=contact.interval + begin) for contact in part.contacts]
+            hits.append(part.hits + begin)
+            begin += len(part)
+        return replace(
+            late,
+            times=self.track.times,
+            states=np.concatenate([part.states for part in parts]),
+            covariances=np.concatenate([part.covariances for part in parts]),
+            status=next((part.status for part in parts if part.status is not Status.OK), late.status),
+            other_sides=np.concatenate([part.other_sides for part in parts]),
+            cross_covariances=np.concatenate([part.cross_covariances for part in parts]),
+            contacts=tuple(contacts),
+            hits=np.concatenate(hits).astype(np.int64),
+            quality=np.concatenate([part.quality for part in parts]),
+        )
+
+    def _minimum(self, window: StreamWindow, events: EventTracker) -> Estimate:
+        """The estimate of the window's samples, with all that is known from those before it."""
+        first, times = window.first, self.track.times
+        part = self.track.between(float(times[first]), float(times[first + len(window) - 1]))
+        found = events.segmentation(first, part.times, part.positions)
+        found = events.with_moved_contacts(found, first)  # the window's states fit the refined contacts
+        problem = self.smoother.problem(part, found)
+        settled = self.smoother.settle(problem, Earlier(window.values, window.summaries()))
+        if not first:  # what has left the window is not known well enough
+            problem, settled = self.smoother.bridged(problem, settled)
+        return self.smoother.result(problem, settled, begins=not first)
 
 
-def freeze(window: StreamWindow, count: int) -> list[Frozen]:
-    """The window's oldest states with their covariances."""
-    kept = zip(window.samples, window.states, window.joint_covariances(count), strict=False)
-    return [Frozen(sample, state, without_bias(joint, window.width)) for sample, state, joint in kept]
+def _oldest(estimate: Estimate, count: int) -> Estimate:
+    """The first states of an estimate, so many, and the events up to the next one."""
+    return replace(
+        estimate,
+        times=estimate.times[:count],
+        states=estimate.states[:count],
+        covariances=estimate.covariances[:count],
+        other_sides=estimate.other_sides[:count],
+        cross_covariances=estimate.cross_covariances[:count],
+        contacts=tuple(contact for contact in estimate.contacts if contact.interval < count),
+        hits=estimate.hits[estimate.hits < count],
+        quality=estimate.quality[:count],
+    )
 
 
-def unknown(sample: Sample, settings: Settings, p: int) -> Frozen:
-    """A state known by its observation alone, because its window could not be solved."""
+def unknown(sample: Sample, settings: Settings, p: int) -> tuple[Array, Array]:
+    """A state (9,) known by its observation alone, and its covariance (9 + p, 9 + p) with the coefficients."""
     state, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM + p)
     state[POSITION], sigma[POSITION] = sample.position, sample.sigma
     sigma[VELOCITY], sigma[SPIN] = settings.velocity_prior, settings.spin_prior
     sigma[STATE_DIM:] = list(settings.coefficients.values())
-    return Frozen(sample, state, np.diag(sigma**2))
-
-
-def final_estimate(
-    smoother: Smoother, window: StreamWindow, track: Track, found: Segmentation, frozen: Sequence[Frozen]
-) -> Estimate:
-    """The result over a whole track, from the events in the window and the states before it."""
-    first = window.first
-    part = track.between(float(track.times[first]), float(track.times[-1]))
-    problem = smoother.problem(part, found)
-    settled = smoother.settle(problem, Earlier(window.values, window.summaries()))
-    if not first:  # what has left the window is not known well enough
-        problem, settled = smoother.bridged(problem, settled)
-    late = smoother.result(problem, settled, begins=not first)
-    if not frozen:
-        return late
-    joints = np.array([f.joint for f in frozen])
-    contacts, hits = list[Contact](), list[int]()
-    for k, (before, state) in enumerate(pairwise(frozen)):
-        motion, start = state.sample.motion, before.sample.time
-        if motion.linked:
-            contacts += [Contact(k, start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]
-        if motion.hit or not motion.linked:
-            hits.append(k)
-    quality = np.array([int(np.argmin(np.abs(SIGMA_FACTOR - f.sample.factor))) for f in frozen], dtype=np.int8)
-    return replace(
-        late,
-        times=track.times,
-        states=np.concatenate((np.array([f.state for f in frozen]), late.states)),
-        covariances=np.concatenate((joints[:, :STATE_DIM, :STATE_DIM], late.covariances)),
-        other_sides=np.concatenate((np.zeros((len(frozen), STATE_DIM, STATE_DIM)), late.other_sides)),
-        cross_covariances=np.concatenate((joints[:, :STATE_DIM, STATE_DIM:], late.cross_covariances)),
-        contacts=(*contacts, *(replace(c, interval=c.interval + first) for c in late.contacts)),
-        hits=np.concatenate((np.array(hits, dtype=np.int64), late.hits + first)),
-        quality=np.concatenate((quality, late.quality)),
-    )
+    return state, np.diag(sigma**2)

@@ -20,7 +20,7 @@ from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.launcher import FIRST_SAMPLES, SpinLabel, group_spin, shows_direction, undirected_spin
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
-from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
+from ballfg.estimation.online.final import Leaving, unknown
 from ballfg.estimation.online.state import Measurement, OnlineState, Sample, Update, measurements_beside
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import reach_within, warmed_up
@@ -119,7 +119,7 @@ class Online(Estimator):
         self._undirected: SpinLabel | None = None  # prior of the spin until the launch shows its direction
         self._monitor: ContactMonitor | None = None  # of the window's ball
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
-        self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
+        self._leaving: Leaving | None = None  # where someone asks for states that left the window
         self._counts = np.zeros(2, dtype=np.int64)
         self._origin = StreamOrigin()
 
@@ -138,7 +138,6 @@ class Online(Estimator):
         other.events = self.events.copy()
         other._monitor = None if self._monitor is None else self._monitor.copy()
         other._stream = copy.deepcopy(self._stream)
-        other._frozen = None if self._frozen is None else list(self._frozen)
         other._counts = self._counts.copy()
         other._origin = copy.copy(self._origin)
         return other
@@ -320,8 +319,8 @@ class Online(Estimator):
             self._samples[0].label = group_spin(self.settings.spins, launch, self.settings.group)
             update = window.start_anew(self._samples)
         if len(window) > 2 * self.lag:
-            if self._frozen is not None:
-                self._frozen += freeze(window, len(window) - self.lag)
+            if self._leaving is not None:
+                self._leaving.take(window, self.events, len(window) - self.lag)
             window.shorten(self.lag)
             self._samples = list(window.samples)
         return max(len(again), len(moved)), update
@@ -344,8 +343,8 @@ class Online(Estimator):
         try:
             return status, self.window.start_anew(self._samples)
         except (RuntimeError, ValueError):
-            if self._frozen is not None:
-                self._frozen += [unknown(s, self.settings, self.window.p) for s in self._samples[:-1]]
+            if self._leaving is not None:
+                self._leaving.lose(self._samples[:-1], self.window.p)
             first = self.window.first + len(self._samples) - 1
             newest = replace(self._samples[-1], motion=FLIGHT, slots=(), bias_slot=None)
         self.window = self._new_window(newest)
@@ -368,8 +367,8 @@ class Online(Estimator):
         if possible(mean[:STATE_DIM]) and variances_positive(joint):
             joint = definite(joint)
         else:
-            lost = unknown(sample, self.settings, window.p)
-            mean, joint = np.concatenate((lost.state, coefficient_means(self.model, self.settings))), lost.joint
+            state, joint = unknown(sample, self.settings, window.p)
+            mean = np.concatenate((state, coefficient_means(self.model, self.settings)))
             status = status if status.failed else Status.IMPLAUSIBLE
         return OnlineState(
             time=sample.time,
@@ -391,12 +390,12 @@ class Online(Estimator):
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track: all samples are pushed, then the window is minimised to a tight tolerance.
 
-        States that left the window before the end stay as they were then. The innovations are those of the pushes.
-        Events are found in the positions, even if these are rough.
+        States that left the window before the end stay as its minimum had them then. The innovations are those of the
+        pushes. Events are found in the positions, even if these are rough.
         """
         stamps, track = track.times, self.prepared(track, factors).since_first()
         self.reset()
-        self._frozen = []
+        leaving = self._leaving = Leaving(Smoother(self.model, self.surfaces, self.settings), track)
         label = self.settings.spin_label(track)
         if label is None and self.settings.spins is not None:
             label = spin_start(None, self.settings)  # else the first sample has the spins of a stream of any group
@@ -414,10 +413,7 @@ class Online(Estimator):
             innovations[name] = np.array([measurement.innovation for _, measurement in measurements])
         assert self.window is not None
         first = self.window.first
-        found = self.events.segmentation(first, track.times[first:], track.positions[first:])
-        found = self.events.with_moved_contacts(found, first)  # the window's states fit the refined contacts
-        smoother = Smoother(self.model, self.surfaces, self.settings)
-        result = final_estimate(smoother, self.window, track, found, self._frozen)
+        result = leaving.whole(self.window, self.events)
         self.reset()
         lost = any(state.status is Status.FAILED for state in states)
         status = Status.NOT_CONVERGED if lost and not result.status.failed else result.status

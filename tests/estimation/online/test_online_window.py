@@ -273,3 +273,39 @@ def test_whether_the_ball_has_bounced_in_the_last_intervals():
     since = len(online._samples) - bounced[-1]  # intervals from the one with the bounce to the newest, both counted
     assert since > 2
     assert [online._has_bounced(count) for count in (1, since - 1, since, since + 1)] == [False, False, True, True]
+
+
+def hopping(low: float, n: int, rng: np.random.Generator) -> tuple[np.ndarray, list[float], np.ndarray]:
+    """Stamps (n,) s, moments of bounces and states (n, 6) of a ball that hops in vacuum, in closed form.
+
+    Args: low: m, height of the centre at a bounce.
+    """
+    times, start, moments, rows = 0.0067 * np.arange(n), 0.0, list[float](), list[np.ndarray]()
+    height, speed, e = low + rng.uniform(0.2, 0.3), rng.uniform(0.0, 1.0), 0.93
+    while start < times[-1]:
+        lasts = (speed + np.sqrt(speed**2 + 2 * 9.81 * (height - low))) / 9.81
+        since = times[(times >= start) & (times < start + lasts)] - start
+        zero = 0.0 * since
+        z, vz = height + speed * since - 0.5 * 9.81 * since**2, speed - 9.81 * since
+        rows.append(np.stack((0.3 * (since + start), zero, z, zero + 0.3, zero, vz), axis=1))
+        start, height, speed = start + lasts, low, e * (9.81 * lasts - speed)
+        moments.append(start)
+    return times, [moment for moment in moments if moment < times[-1]], np.concatenate(rows)
+
+
+def test_states_that_left_the_window_know_their_bounces():
+    """The table is 5 mm off its nominal height, 2 ms of a bounce: the estimate finds it, the segmentation cannot."""
+    model = nominal_model()
+    with torch.no_grad():
+        for name in ("flight.drag.k", "bounce.friction.mu"):
+            model.get_parameter(name).zero_()
+    chosen, odd = Settings.for_measured(model, position_noise=(SIGMA,) * 3), []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        times, moments, true = hopping(0.02 - 0.003 - 0.005, 400, rng)
+        track = Track(times, true[:, :3] + SIGMA * rng.standard_normal((len(times), 3)), name="hops")
+        estimate = Online(model, TABLE, chosen).estimate(track)
+        assert np.abs(np.array([contact.time for contact in estimate.contacts]) - moments).max() < 1.2e-3
+        beside = np.unique(np.searchsorted(times, moments)[:, None] - [1, 0])
+        odd += (np.abs(estimate.states[:, :6] - true) / estimate.sigmas[:, :6])[beside].max(axis=1).tolist()
+    assert max(odd) < 5.0

@@ -145,11 +145,6 @@ class ChainWindow(StreamWindow):
         self._chain = carries, shared, root
         self._rows[0] = self._rows_of(0, moved=False)
 
-    def joint_covariances(self, count: int) -> list[Array]:
-        """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
-        found = marginal_covariances(self._root(0))
-        return [found.joint(k) for k in range(count)]
-
     def summaries(self) -> list[FactorBatch]:
         """The information of removed states, as one linear factor."""
         if not self.first or self._summary is None:

@@ -117,10 +117,6 @@ class StreamWindow(ABC):
         """
 
     @abstractmethod
-    def joint_covariances(self, count: int) -> list[Array]:
-        """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
-
-    @abstractmethod
     def summaries(self) -> list[FactorBatch]:
         """The information of removed states on the first state and the coefficients, numbered as in the window."""
 

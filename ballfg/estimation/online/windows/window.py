@@ -261,11 +261,6 @@ class IsamWindow(StreamWindow):
         sample.slots, sample.bias_slot = (*sample.slots, *slots), None
         self._read_back()
 
-    def joint_covariances(self, count: int) -> list[Array]:
-        """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
-        shared, first = [COEFFICIENT_KEY] * (self.p > 0), STATE_KEY + self.first
-        return [self.isam.jointMarginalCovariance([first + k, *shared]).fullMatrix() for k in range(count)]
-
     def summaries(self) -> list[FactorBatch]:
         """The linear factors from removed states, about the present estimate."""
         values = self.values if self.first else None
