@@ -168,20 +168,23 @@ class Observation(ABC):
     def judged(self, estimate: "Estimate") -> "Estimate":
         """The estimate of its track, with a status that says what the observation leaves open.
 
-        By default it gets a note where measurements contradict each other and the motion by far more than they state.
+        By default it gets a note where measurements, or those of one source, contradict each other and the motion by
+        far more than they state.
         """
-        far = scatter(estimate.innovations[self.name])
+        far, parts = scatter(estimate.innovations[self.name]), self._parts(estimate)
+        far = far if far > MOST_SCATTER else max(parts.values(), default=far)  # one source among good ones
         if not far > MOST_SCATTER:
             return estimate
+        each = ", ".join(f"{shown(name)}: {own:.2g}" for name, own in parts.items())
         note = (
             f"the measurements '{self.name}' lie {far:.2g} times as far from the motion as they state"
-            f"{self._parts(estimate)}: covariances are too small. Check {self.causes}."
+            f"{f' ({each})' if each else ''}: covariances are too small. Check {self.causes}."
         )
         return replace(estimate, notes=(*estimate.notes, note))
 
-    def _parts(self, estimate: "Estimate") -> str:
-        """The same figure of each source of the measurements, in brackets; by default nothing."""
-        return ""
+    def _parts(self, estimate: "Estimate") -> Mapping[str, float]:
+        """The same figure of each source of the measurements, by its name; by default of none."""
+        return {}
 
     def onto(self, old: Track, new: Track) -> "Observation":
         """The same measurements on a track of the same ball with other stamps.

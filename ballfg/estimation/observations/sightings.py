@@ -243,12 +243,12 @@ class CameraSightings(Observation):
         loose = np.median(sigma) > LOOSE_DEPTH or np.median(sigma / distance) > LOOSE_SHARE
         return replace(estimate, status=Status.DEPTH_UNCERTAIN) if loose else estimate
 
-    def _parts(self, estimate: Estimate) -> str:
-        seen, found = estimate.innovations[self.name], self.sightings.camera
+    def _parts(self, estimate: Estimate) -> Mapping[str, float]:
         if len(self.cameras) == 1:
-            return ""
-        each = ((camera.name, scatter(seen[found == number])) for number, camera in enumerate(self.cameras))
-        return f" ({', '.join(f'{shown(name)}: {far:.2g}' for name, far in each if np.isfinite(far))})"
+            return {}
+        seen, found = estimate.innovations[self.name], self.sightings.camera
+        each = {camera.name: scatter(seen[found == number]) for number, camera in enumerate(self.cameras)}
+        return {name: far for name, far in each.items() if np.isfinite(far)}
 
     def segmentation(self) -> Segmentation | None:
         """The bounces of a track that one camera saw; None if the positions show the events."""

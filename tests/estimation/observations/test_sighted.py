@@ -269,6 +269,16 @@ def test_cameras_that_contradict_each_other_are_noted(ball: World, cameras: tupl
     assert re.search(r"'sighting' lie [\d.]+ times as far.*'left': .*'right': .*Check the cameras' clocks", note)
 
 
+@pytest.mark.parametrize("seed", [0, 3, 6])
+def test_one_late_camera_of_three_is_noted(ball: World, seed: int) -> None:
+    """Two good cameras have two thirds of the sightings: the median of all is then nearly right."""
+    made = scene(seed, ball, rig=RIG, phases=(0.0, 1 / 3, 2 / 3))
+    (note,) = smoother(ball).estimate(track_of(made, cameras=late((0.0, 0.02, 0.0)))).notes
+    found = {name: float(far) for name, far in re.findall(r"'(left|right|back)': ([\d.]+)", note)}
+    assert max(found, key=lambda name: found[name]) == "right"
+    assert found["right"] > 10.0
+
+
 @pytest.mark.parametrize("method", ["ekf", "sliding-window"])
 def test_others_use_the_rough_positions(ball: World, made: Scene, method: str) -> None:
     track = track_of(made)
