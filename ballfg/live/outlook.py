@@ -62,11 +62,10 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
 
 def _finders(state: OnlineState, horizon: float, plane: Plane | None) -> dict[str, Callable[[], EventAhead]]:
     """What finds each event. Probabilities always need possible balls, so they are given where a plane is asked for."""
-    carried = carried_by(state)
-    path = Path(state, carried, horizon)
+    path = Path(state, carried_by(state), horizon)
     if plane is None:
         return {
-            "bounce": lambda: EventAhead(*contact_ahead(state, carried, horizon)),
+            "bounce": lambda: EventAhead(*contact_ahead(path)),
             "apex": lambda: EventAhead(path.apex(), math.nan),
         }
     asked: dict[str, Plane | str] = {"bounce": CONTACT, "apex": APEX, "crossing": plane}

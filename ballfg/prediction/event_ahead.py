@@ -52,32 +52,21 @@ def event_on(path: "Path", asked: Plane | str) -> EventAhead:
         return EventAhead(path.crossing(asked), _chance_of(path, asked))
     if asked == APEX:
         return EventAhead(path.apex(), path.probability(TOP, 0.0, "down"))
-    return EventAhead(*contact_ahead(path.start, path.carried, path.horizon))
+    return EventAhead(*contact_ahead(path))
 
 
-def crossing_of(carried: Carried, plane: Plane, horizon: float) -> Crossing | None:
-    """The crossing of a plane by the mean path, after its number of bounces; None without one within the horizon."""
-    since = -np.inf
-    for _ in range(plane.after):
-        contact = next_contact(*carried, horizon, after=since)
-        if contact is None:
-            return None
-        since = contact.time
-    return plane_crossing(*carried, plane.normal, plane.offset, horizon, after=since, direction=plane.direction)
-
-
-def contact_ahead(start: "BallState", carried: Carried, horizon: float) -> tuple[Crossing | None, float]:
-    """The next contact within a horizon, s, and the probability that there is one.
+def contact_ahead(path: "Path") -> tuple[Crossing | None, float]:
+    """The next contact within the horizon, and the probability that there is one.
 
     While the state is in doubt whether the ball has bounced just now, a ball on the other side has another contact: the
     bounce itself, or the one after it. So has one that passes an end of the table on the other side than the mean. The
     numbers of the mean's contact then spread to those too.
     """
-    found, end = next_contact(*carried, horizon + LATER), start.time + horizon
+    found, end = path.contact(), path.start.time + path.horizon
     chance = 0.0 if found is None else _sooner(found, end - found.time)
-    if _may_pass_an_end(start, carried[0].surfaces, found):
-        found, chance = _past_or_not(start, carried, horizon, (found, chance))
-    share, other = _other_contact(start, carried, found, horizon)
+    if _may_pass_an_end(path.start, path.carried[0].surfaces, found):
+        found, chance = _past_or_not(path, found, chance)
+    share, other = _other_contact(path, found)
     if other is not None:
         chance += share * (_sooner(other, end - other.time) - chance)
         if found is not None:
@@ -97,20 +86,19 @@ def _may_pass_an_end(start: "BallState", surfaces: Surfaces, found: Crossing | N
     return bool((np.abs(found.state[:2].repeat(2) - surfaces.extent) < near).any())
 
 
-def _past_or_not(
-    start: "BallState", carried: Carried, horizon: float, mean: tuple[Crossing | None, float]
-) -> tuple[Crossing | None, float]:
+def _past_or_not(path: "Path", found: Crossing | None, chance: float) -> tuple[Crossing | None, float]:
     """The mean's contact and its probability; from possible balls if these differ in the surface that they meet."""
-    balls, heights = Path(start, carried, horizon + LATER).possible, carried[0].surfaces.heights()
+    heights = path.carried[0].surfaces.heights()
+    balls = Path(path.start, path.carried, path.horizon + LATER).possible
     bounces = np.diff(balls.met, axis=1) > 0.0
     rows, at = np.flatnonzero(bounces.any(axis=1)), bounces.argmax(axis=1)
     states, times = balls.states[rows, at[rows]], balls.times[rows, at[rows]]
     upper = int((states[:, Z] > sum(heights) / len(heights)).sum())
     if len(rows) == len(bounces) and upper in (0, len(rows)):
-        return mean
-    found, chance = mean[0], float((times <= horizon).sum() / len(bounces))
+        return found, chance
+    chance = float((times <= path.horizon).sum() / len(bounces))
     if found is not None and len(rows):
-        found = _spread_over(found, states, times - (found.time - start.time))
+        found = _spread_over(found, states, times - (found.time - path.start.time))
     return found, chance
 
 
@@ -126,20 +114,19 @@ def _sooner(found: Crossing, left: float) -> float:
 
 
 @torch.no_grad()
-def _other_contact(
-    start: "BallState", carried: Carried, found: Crossing | None, horizon: float
-) -> tuple[float, Crossing | None]:
+def _other_contact(path: "Path", found: Crossing | None) -> tuple[float, Crossing | None]:
     """The share of balls on the other side of a present bounce, and their next contact; None without any doubt.
 
     The share follows from the variance of the vertical speed that the doubt gives and the jump of that speed.
     """
-    variance, belief = 0.0 if start.other_side is None else float(start.other_side[VZ, VZ]), carried[1]
+    start, belief = path.start, path.carried[1]
+    variance = 0.0 if start.other_side is None else float(start.other_side[VZ, VZ])
     rises, before = float(start.state[VZ]) > 0.0, belief.mean.clone()
     if variance <= 0.0 or (found is None and not rises):
         return 0.0, None
     if found is not None and not rises:
         before[0, :STATE_DIM] = torch.from_numpy(found.state)
-        other = next_contact(*carried, horizon + LATER, after=found.time)
+        other = path.contact(found.time)
     else:
         before[0, VZ] *= -1.0  # had it come down as fast as it rises, it would rise more slowly, by the restitution
         before[0, VZ] = -(before[0, VZ] ** 2) / belief.model.after_bounce(before)[0, VZ]
@@ -154,8 +141,7 @@ def _chance_of(path: "Path", plane: Plane) -> float:
     chance = path.probability(*asked, plane.after)
     if not plane.after or path.start.other_side is None:
         return chance
-    found = next_contact(*path.carried, path.horizon + LATER)
-    share, _ = _other_contact(path.start, path.carried, found, path.horizon)
+    share, _ = _other_contact(path, path.contact())
     other = path.probability(*asked, plane.after + (-1 if path.start.state[VZ] > 0.0 else 1))
     return chance + share * (other - chance)
 
@@ -214,9 +200,29 @@ class Path:
         chance = (pushes[:, spans], kicks * noise[[3, 3, 2]], off)
         return Scattered.of(belief.model, start, h, chance, surfaces)
 
+    @cached_property
+    def _contacts(self) -> list[Crossing | None]:
+        """The mean ball's contacts as far as they have been searched; None after the last one."""
+        return []
+
+    def contact(self, after: float = -math.inf) -> Crossing | None:
+        """The mean ball's first contact later than a time, s, until `LATER` beyond the horizon; searched once."""
+        known = self._contacts
+        while not known or (known[-1] is not None and known[-1].time <= after):
+            since = known[-1].time if known and known[-1] is not None else -math.inf
+            known.append(next_contact(*self.carried, self.horizon + LATER, after=since))
+        return next((one for one in known if one is None or one.time > after), None)
+
     def crossing(self, plane: Plane) -> Crossing | None:
         """The crossing of a plane by the mean ball, with the covariance of all balls about it that have one."""
-        found = crossing_of(self.carried, plane, self.horizon)
+        since = -math.inf
+        for _ in range(plane.after):
+            contact = self.contact(since)
+            if contact is None:
+                return None
+            since = contact.time
+        line = (plane.normal, plane.offset)
+        found = plane_crossing(*self.carried, *line, self.horizon, after=since, direction=plane.direction)
         return None if found is None else self._of_all(found, *_line_of(plane), plane.direction, plane.after)
 
     def apex(self) -> Crossing | None:
@@ -250,14 +256,14 @@ class Path:
         if not line[VZ]:
             speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
             about += FAR * math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed
-        contact = next_contact(*self.carried, self.horizon + LATER, after=found.time - about)
+        contact = self.contact(found.time - about)
         return contact is not None and contact.time <= found.time + about
 
     def _by_an_end(self, until: float) -> bool:
         """Whether the mean's contacts up to a time (s), or its fall past the table then, may be another ball's not."""
         (propagator, _), since = self.carried, -np.inf
         while propagator.surfaces.extent is not None and since < until:
-            contact = next_contact(*self.carried, self.horizon + LATER, after=since)
+            contact = self.contact(since)
             time = np.inf if contact is None else contact.time
             past = contact is None or not contact.state[Z] > propagator.surfaces.table_height
             if (past or time < until) and _may_pass_an_end(self.start, propagator.surfaces, contact):

@@ -67,7 +67,7 @@ class Forecast:
     @cached_property
     def next_contact(self) -> Crossing | None:
         """The state right before the next contact with a surface; None if there is none within the horizon."""
-        return contact_ahead(self.start, self._carried, self.horizon)[0]
+        return contact_ahead(self._path)[0]
 
     @cached_property
     def apex(self) -> Crossing | None:

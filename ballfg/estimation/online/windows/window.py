@@ -10,7 +10,6 @@ from typing import Self
 import gtsam
 import numpy as np
 
-from ballfg.arrays import Array
 from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
 from ballfg.estimation.online.windows.isam import eliminating_last, key_list, parameters
 from ballfg.estimation.online.windows.linear import LinearFactors, bias_link, bias_start, linear_factor, linearized
