@@ -32,6 +32,7 @@ from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings, Solver, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
+from ballfg.estimation.sides.struck import HitDoubt
 from ballfg.estimation.smoother.motion import FLIGHT
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
@@ -118,6 +119,7 @@ class Online(Estimator):
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
         self._undirected: SpinLabel | None = None  # prior of the spin until the launch shows its direction
         self._monitor: ContactMonitor | None = None  # of the window's ball
+        self._hit = HitDoubt(self.settings, self.events.settings)
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._leaving: Leaving | None = None  # where someone asks for states that left the window
         self._counts = np.zeros(2, dtype=np.int64)
@@ -137,6 +139,7 @@ class Online(Estimator):
             other.window = self.window.copy(other._samples[: len(self.window)])
         other.events = self.events.copy()
         other._monitor = None if self._monitor is None else self._monitor.copy()
+        other._hit = copy.copy(self._hit)
         other._stream = copy.deepcopy(self._stream)
         other._counts = self._counts.copy()
         other._origin = copy.copy(self._origin)
@@ -239,8 +242,23 @@ class Online(Estimator):
         newest = self._samples[-1]
         if status is Status.OK and not newest.motion.linked:  # a long gap before it
             status = Status.NO_VELOCITY
-        contact = self._near_contact(None if rebuilt else before, newest)
-        return self._state(update, revised, rebuilt, status, contact)
+        before = None if rebuilt else before
+        contact = self._near_contact(before, newest)
+        state = self._state(update, revised, rebuilt, status, contact)
+        return state if contact is not None else self._in_doubt_of_a_hit(state, before, newest)
+
+    def _in_doubt_of_a_hit(self, state: OnlineState, before: tuple[Array, Array] | None, sample: Sample) -> OnlineState:
+        """The newest state, its covariance widened where its sample may have followed a hit that nothing tells yet."""
+        motion = sample.motion
+        known = before is None or not sample.measured or motion.hit or not motion.linked or motion.rest is not None
+        if known or not possible(state.state):
+            self._hit.reset()
+            return state
+        assert before is not None
+        dt = sample.time - self._samples[-2].time
+        return replace(
+            state, joint=self._hit.widened(before, dt, sample.position, sample.whole, (state.mean, state.joint))
+        )
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from ballfg.dynamics import nominal_model
+from ballfg.dynamics import nominal_model, rollout
 from ballfg.estimation.online.events import EventTracker, contact_step
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.segmentation.physics import physics_of
@@ -145,3 +146,46 @@ def test_long_gap_starts_anew():
         assert np.abs((last.state - truth[-1]) / np.sqrt(np.diag(last.covariance))).max() < 4.0
         expected = Smoother(online.model, NOWHERE, chosen).estimate(track)
         assert distance(online.estimate(track).states, expected) < SAME
+
+
+@pytest.mark.parametrize("solver", ["gtsam", "ballfg"])
+@pytest.mark.parametrize("rate", [60.0, 150.0])
+def test_states_just_after_a_hit_do_not_claim_the_flight_before(solver, rate):
+    """A racket turns the ball round between two samples; nothing tells of it until the second or third one."""
+    model, rng, far, told = nominal_model(), np.random.default_rng(4), [], []
+    dt = 1.0 / rate
+    for _ in range(12):
+        start = np.array([0.0, 0.2, 0.6, 4.0, rng.normal(), 1.0, 0.0, 30.0, 0.0])
+        n, late = int(0.25 * rate), rng.uniform(0.2, 0.8) * dt
+        before = _flown(model, start, np.append(np.arange(n) * dt, (n - 1) * dt + late))
+        struck = before[-1].copy()
+        struck[3:6] = -1.2 * struck[3], rng.normal(), 2.5
+        after = _flown(model, struck, np.arange(1, 12) * dt - late)
+        states = np.vstack((before[:-1], after))
+        online = Online(model, NOWHERE, settings(solver=solver))
+        for k, x in enumerate(states):
+            state = online.push(k * dt, x[:3] + SIGMA * rng.standard_normal(3))
+            error = np.abs(state.state - x)[3:6] / np.sqrt(np.diag(state.joint))[3:6]
+            if n <= k < n + 3:
+                far.append(error.max() > 4.0)
+            elif k >= n + 6 or 8 < k < n:
+                told.append(np.sqrt(np.diag(state.joint))[3:6].max())
+    assert np.mean(far) < 0.1
+    assert np.median(told) < 0.2
+
+
+def test_an_outlier_beyond_the_reach_of_a_hit_is_none():
+    """At 500 Hz no hit moves a ball by half a metre within a sample."""
+    track, _ = make_track(FLYING, n=60, surfaces=NOWHERE, dt=0.002)
+    online, plain = Online(nominal_model(), NOWHERE, settings()), Online(nominal_model(), NOWHERE, settings())
+    for k, (t, z) in enumerate(zip(track.times.tolist(), track.positions, strict=True)):
+        state, expected = online.push(t, z + 0.5 * (k == 40)), plain.push(t, z)
+        if k == 40:
+            ratio = np.sqrt(np.diag(state.joint) / np.diag(expected.joint))
+            assert ratio[3:6].max() < 1.5
+
+
+def _flown(model, start, times):
+    """(n, 9) states of a ball at some times, without surfaces."""
+    state = torch.from_numpy(start)[None]
+    return rollout(model, state, torch.from_numpy(times), NOWHERE)[0].detach().numpy()
