@@ -154,7 +154,7 @@ def _structure(module: nn.Module) -> Hashable:
     buffers = tuple((name, tuple(b.shape)) for name, b in module.named_buffers(recurse=False))
     parameters = tuple((name, tuple(p.shape)) for name, p in module.named_parameters(recurse=False))
     return (
-        f"{type(module).__module__}.{type(module).__qualname__}",
+        type(module),  # and not its name: a cell of a notebook that runs again defines another class of that name
         tuple(sorted(own.items())),
         tuple(sorted(getattr(module, "tabled", ()))),
         parameters,

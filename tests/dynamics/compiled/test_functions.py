@@ -154,6 +154,13 @@ def test_an_effect_that_was_edited_is_traced_again(monkeypatch, tmp_path) -> Non
         cache_folder.cache_clear()
 
 
+def test_a_class_that_is_defined_again_has_functions_of_its_own() -> None:
+    """As in a repeated cell of a notebook: module and name stay."""
+    for law in (torch.sin, torch.cos):
+        again = type("Again", (Pull,), {"acceleration": lambda self, flight, law=law: self.k * law(flight.velocity)})
+        agree(ball(again(2)))
+
+
 def test_what_agreed_is_compared_again_for_classes_of_others_alone(monkeypatch, tmp_path) -> None:
     """The sources of ballfg's classes are in the key of the note; a user's class, or a replaced method, is compared."""
     monkeypatch.setenv("BALLFG_CACHE", str(tmp_path))
