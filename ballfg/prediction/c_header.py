@@ -71,6 +71,10 @@ TEXT: Final = """\
 #ifndef {guard}
 #define {guard}
 
+#if (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__) || defined(_M_FP_FAST)
+#error "{p}.h needs NaN and infinity: compile it without -ffast-math, -Ofast, -ffinite-math-only or /fp:fast"
+#endif
+
 #include <math.h>
 #include <stdint.h>
 

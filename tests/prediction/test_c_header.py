@@ -244,6 +244,16 @@ def test_header(in_c: InC, tmp_path: Path) -> None:
         subprocess.run([cpp, *STRICT, "-fsyntax-only", "ball.cpp"], cwd=tmp_path, check=True)
 
 
+@pytest.mark.parametrize("option", ["-ffast-math", "-ffinite-math-only"])
+def test_options_that_drop_nan_are_refused(option: str, tmp_path: Path) -> None:
+    """With them states that are not numbers were counted as written."""
+    (tmp_path / "ball.h").write_text(c_header(nominal_model(), "ball"))
+    words = [str(CC), "-std=c99", "-O3", option, "-fsyntax-only", "ball.h"]
+    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert said.returncode != 0
+    assert f"compile it without {option}" in said.stderr or f"-Ofast, {option}" in said.stderr
+
+
 def test_the_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     shell, program, compiling = re.findall(r"```\w*\n(.*?)```", (DOCS / "export.md").read_text("utf-8"), re.DOTALL)
