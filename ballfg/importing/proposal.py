@@ -39,7 +39,7 @@ class Recordings:
 
     Attributes:
         tracks: as they were recorded.  flights: those of each track; the track itself if nothing else is in it.
-        share: of the samples that are flight, 0 to 1.  smoothing, others: as of `InFlight`.
+        share: of the samples that are flight, 0 to 1.  smoothing, others, repeated: as of `InFlight`.
     """
 
     tracks: Sequence[Track]
@@ -47,6 +47,7 @@ class Recordings:
     share: float
     smoothing: float
     others: str
+    repeated: str
 
     @property
     def cut(self) -> list[Track]:
@@ -77,7 +78,7 @@ class Recordings:
             )
         if self.smoothing > SMOOTHED:
             said.append(smoothed(self.smoothing))
-        said += filter(None, [self.others])
+        said += filter(None, [self.others, self.repeated])
         if len(self.cut) < LEAST_TRACKS:
             said.append(FEW_TRACKS)
         return [*said, *clipped(self.tracks)]
@@ -106,7 +107,7 @@ def recordings(tracks: Sequence[Track]) -> Recordings:
     found = Contents.of(labelled, lambda _, labels: flies_throughout(labels))
     pieces = (found.pieces[track.name] for track in tracks)
     flights = [[track] if own is None else tracks_of(track, own) for track, own in zip(tracks, pieces, strict=True)]
-    return Recordings(tracks, flights, found.share, found.smoothing, found.others)
+    return Recordings(tracks, flights, found.share, found.smoothing, found.others, found.repeated)
 
 
 MOST_QUESTIONS: Final = 8  # Largest number of questions about one source; with more, something else is wrong

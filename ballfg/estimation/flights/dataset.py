@@ -29,6 +29,7 @@ FARTHEST: Final = 0.1  # m. Scatter from sample to sample beyond that of tracker
 UNDISTURBED: Final = 0.2  # Quantile of that ratio: stretches with a bounce or a hit have larger ones
 SMOOTHING: Final = "a filter smoothed the positions"
 OTHER: Final = "of another ball, or outliers"
+REPEATED: Final = "a tracker held or rounded them"
 SPAN: Final = 0.25  # s, of the cubics whose residuals show the errors
 LEAST_SPAN: Final = 8  # Samples, likewise
 ROUNDING: Final = 5e-5  # m. Errors below are those of rounding
@@ -77,6 +78,7 @@ class InFlight:
         share: of the samples that are flight, 0 to 1.
         smoothing: ratio of slow to fast errors of the positions; 1 if they are white; NaN if unknown.
         others: sentence on samples that are not of the ball; empty without.
+        repeated: sentence on positions that are those of the sample before; empty without.
     """
 
     dataset: Dataset
@@ -85,6 +87,7 @@ class InFlight:
     share: float
     smoothing: float
     others: str
+    repeated: str
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -100,11 +103,11 @@ class InFlight:
 
     @property
     def filtered(self) -> tuple[str, ...]:
-        """Sentences on a filter that smoothed the positions and on other balls, unless `dataset.yaml` has them."""
+        """Sentences on smoothed or repeated positions and on other balls, unless `dataset.yaml` has them."""
         found = {SMOOTHING: smoothed(self.smoothing)} if self.smoothing > SMOOTHED else {}
-        found |= {OTHER: self.others} if self.others else {}
+        found |= {OTHER: self.others, REPEATED: self.repeated}
         known = " ".join(self.dataset.info.doubts)
-        return tuple(said for sign, said in found.items() if sign not in known)
+        return tuple(said for sign, said in found.items() if said and sign not in known)
 
     def check(self, where: object, anyway: bool, say: str = ", or say --anyway") -> None:
         """Refuses a dataset that is mostly no flight. Args: say: how to use it anyway. Raises: ValueError."""
@@ -130,6 +133,16 @@ def others(lost: float, jump: float) -> str:
     return f"{100 * lost:.0f} % of the samples lie off the ball's path: they are {OTHER}" if lost > OTHERS else ""
 
 
+def repeated(share: float) -> str:
+    """The sentence on repeated positions; empty without. Args: share: of the samples of flying balls."""
+    if share <= OTHERS:
+        return ""
+    return (
+        f"{100 * share:.0f} % of the positions in flight repeat the one before them: {REPEATED}; leave the repeats "
+        "out, or velocities lag and sigmas are too small"
+    )
+
+
 @lru_cache(maxsize=16)
 def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     """The flights of a dataset.
@@ -148,7 +161,7 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     found = Contents.of(zip(tracks, labels, strict=True), whole)
     mixed = sum(pieces is not None for pieces in found.pieces.values())
     flights = FlightsOf(dataset, found.pieces) if mixed else dataset
-    return InFlight(flights, len(found.pieces), mixed, found.share, found.smoothing, found.others)
+    return InFlight(flights, len(found.pieces), mixed, found.share, found.smoothing, found.others, found.repeated)
 
 
 @dataclass(frozen=True)
@@ -158,30 +171,34 @@ class Contents:
     Attributes:
         pieces: flights by name of the track; None where a track is used as a whole.
         share: of the samples that are flight, 0 to 1.
-        smoothing, others: as of `InFlight`.
+        smoothing, others, repeated: as of `InFlight`.
     """
 
     pieces: "dict[str, list[Piece] | None]"
     share: float
     smoothing: float
     others: str
+    repeated: str
 
     @classmethod
     def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> "Contents":
         """Of labelled tracks. Args: whole: True for a track that is used as a whole."""
         pieces: dict[str, list[Piece] | None] = {}
-        ratios, jumps, samples, flying, lost = list[Array](), list[float](), 0, 0, 0
+        ratios, jumps, samples, flying, lost, again = list[Array](), list[float](), 0, 0, 0, 0
         for track, labels in labelled:
             own = pieces[track.name] = None if whole(track, labels) else pieces_of(labels)
             samples += len(track)
             lost += int((labels.values == Label.LOST).sum())
+            same = (np.diff(track.positions, axis=0) == 0.0).all(axis=1)
+            again += int((same & (labels.values[1:] == Label.FLIGHT)).sum())
             flying += len(track) if own is None else int((labels.values == Label.FLIGHT).sum())
             if len(pieces) <= LOOKED_AT:
                 ratios.append(error_ratios(track, labels))
                 jumps += [float(scatter(track.seconds, track.positions).max())] if len(track) >= FEWEST else []
         held = np.concatenate(ratios)
         smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
-        return cls(pieces, flying / samples, smoothing, others(lost / samples, float(np.median(jumps or [0.0]))))
+        strange = others(lost / samples, float(np.median(jumps or [0.0])))
+        return cls(pieces, flying / samples, smoothing, strange, repeated(again / max(flying, 1)))
 
 
 def error_ratios(track: Track, labels: Labels) -> Array:

@@ -143,6 +143,23 @@ def test_a_low_pass_shows() -> None:
         assert len(error_ratios(one.track, label_samples(one.track, PHYSICS)))
 
 
+def test_positions_that_a_tracker_holds_for_a_stamp_show() -> None:
+    """Half of the samples are no measurements; a ball that lies still repeats its place rightly."""
+    whole = _thrown(np.random.default_rng(3))
+    held = replace(whole, positions=np.repeat(whole.positions[::2], 2, axis=0)[: len(whole)])
+    lies = Track(np.arange(100) / 100, np.tile([0.5, 0.0, 0.78], (100, 1)), name="lies")
+    once = Track(held.times[::2], held.positions[::2], name=held.name)
+    said, cases = {}, {"whole": [whole], "held": [held], "without repeats": [once], "lies": [whole, lies]}
+    for name, tracks in cases.items():
+        found = in_flight(dataset_in_memory(INFO, tracks))
+        said[name] = [line for line in found.lines if "a tracker held" in line]
+    assert said.pop("held") == [
+        "50 % of the positions in flight repeat the one before them: a tracker held or rounded them; leave the repeats "
+        "out, or velocities lag and sigmas are too small"
+    ]
+    assert not any(said.values())
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Four recordings, mostly held."""
