@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from ballfg.dynamics import load_model
-from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
+from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, write_simulation
 from ballfg.tracks import TABLE_TENNIS, read_dataset
 from ballfg.tracks.info import DatasetInfo, write_info
 from ballfg.vision.camera_file import write_cameras
@@ -36,6 +37,25 @@ def test_table_and_files(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert noise is not None
     assert noise == read_dataset(shots).info.noise  # stated in both files now
     assert status("predict", shots, "--model", out, "--observe", 0.3, "--jobs", 1, "--out", tmp_path / "p.csv") == 0
+
+
+def test_exact_positions_are_no_doubt_and_show_all_other_noise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of another simulator, for instance: the positions are known to be better than any tracker's."""
+    folder, process = tmp_path / "exact", MotionNoise(acceleration=0.05)
+    config = SimulationConfig(8, 100.0, seed=3, noise=MeasurementNoise(position=1e-9), process=process)
+    write_simulation(folder, config)
+    write_info(folder / "dataset.yaml", replace(read_dataset(folder).info, position_noise=None))
+    assert status("noise", folder) == 0
+    said = capsys.readouterr()
+    assert "a filter smoothed" not in said.out + said.err
+    white = re.findall(r"new in each sample.*\(below ([\d.]+)\)", said.out)
+    assert len(white) == 3
+    assert max(map(float, white)) < 0.05  # mm
+    found = re.search(r"acceleration that the model lacks +([\d.]+)", said.out)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(0.05, rel=0.2)
 
 
 def test_written_noise_is_no_prior_of_the_next_one(shots: Path, capsys: pytest.CaptureFixture[str]) -> None:

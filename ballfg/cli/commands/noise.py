@@ -125,8 +125,9 @@ def _of_pixels(given: "inputs.Inputs[SightedDataset]", most: int) -> None:
 
 def check_known(found: "NoiseEstimate", dataset: Path) -> None:
     """Refuses noise that the tracks do not show, or that no ball has. Raises: ValueError."""
-    positions = [error for name, error in found.relative_errors.items() if name.startswith("position")]
-    unknown = min(positions, default=0.0) >= PRIOR
+    positions = [name for name in found.relative_errors if name.startswith("position")]
+    unknown = min((found.relative_errors[name] for name in positions), default=0.0) >= PRIOR
+    unknown = unknown and all(math.isinf(found.intervals[name][1]) for name in positions)  # else they are exact
     content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
     held = {name: content.get(name) or 0.0 for name in MOST}
     largest = {name: max(value) if isinstance(value, list | tuple) else float(value) for name, value in held.items()}

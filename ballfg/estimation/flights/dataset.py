@@ -32,7 +32,7 @@ OTHER: Final = "of another ball, or outliers"
 REPEATED: Final = "a tracker held or rounded them"
 SPAN: Final = 0.25  # s, of the cubics whose residuals show the errors
 LEAST_SPAN: Final = 8  # Samples, likewise
-ROUNDING: Final = 5e-5  # m. Errors below are those of rounding
+ROUNDING: Final = 2e-4  # m. Errors below are those of rounding, or of the cubics: 0.12 mm where drag is largest
 LOOKED_AT: Final = 200  # Number of tracks that show whether a filter smoothed the positions
 
 
