@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.networks.gram_schmidt import CONTACT_FEATURES, FLIGHT_FEATURES, contact_frame, flight_frame
 from ballfg.state import SPIN, VELOCITY, VZ
@@ -17,6 +17,7 @@ MOST_CENTRES: Final = 200
 LEAST_GROUPS: Final = 8  # Smallest number of tracks for a density; with fewer its weight is zero
 LEAST_SPREAD: Final = 0.03  # Smallest spread of a feature in [-1, 1], for a launcher that always does the same
 EDGE: Final = 0.05  # Share of held-out training features whose weight is below one half
+GOLDEN: Final = 0.5 * (5.0**0.5 - 1.0)
 BANDWIDTHS: Final = np.geomspace(0.05, 2.0, 30)  # Kernel widths to choose from, in standard deviations of the features
 
 
@@ -61,11 +62,13 @@ class FeatureDensity(nn.Module):
         groups = [group for group in groups if len(group)]
         if len(groups) < LEAST_GROUPS:
             return cls(0, features)
-        each = max(1, MOST_CENTRES // len(groups))
-        rows = [np.linspace(0, len(group) - 1, min(each, len(group))).round().astype(int) for group in groups]
+        spread = np.concatenate(groups).std(axis=0) + LEAST_SPREAD
+        groups = [
+            groups[i] for i in np.linspace(0, len(groups) - 1, min(MOST_CENTRES, len(groups))).round().astype(int)
+        ]
+        rows = [_rows(number, len(group), MOST_CENTRES // len(groups)) for number, group in enumerate(groups)]
         kept = np.concatenate([group[row] for group, row in zip(groups, rows, strict=True)])
         owner = np.repeat(np.arange(len(groups)), [len(row) for row in rows])
-        spread = np.concatenate(groups).std(axis=0) + LEAST_SPREAD
         centres = kept / spread
         square = ((centres[:, None] - centres[None]) ** 2).sum(axis=-1)
         other = owner[:, None] != owner[None]
@@ -80,6 +83,16 @@ class FeatureDensity(nn.Module):
         density.width = torch.tensor(BANDWIDTHS[best], dtype=torch.float64)
         density.edge = torch.tensor(max(np.quantile(densities[best], EDGE), 1e-9), dtype=torch.float64)
         return density
+
+
+def _rows(number: int, size: int, most: int) -> Index:
+    """Up to `most` rows of a track of some size, evenly over it; they begin elsewhere in each track.
+
+    The golden ratio spreads the beginnings, so that one row of each of many tracks shows all of a flight.
+    """
+    count = min(most, size)
+    begin = number * GOLDEN % 1.0
+    return np.asarray((np.arange(count) + begin) * size / count).astype(np.int64)
 
 
 DOUBT: Final = "fading."  # Prefix of the doubts' names in a `LearnedModel`

@@ -12,7 +12,14 @@ import torch
 from ballfg.dynamics import Architecture, build, load_model, nominal_model, save_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.motion.integrate import fly_jacobian
-from ballfg.dynamics.networks.fading import ABROAD, Fading, FeatureDensity, states_before_contacts
+from ballfg.dynamics.networks.fading import (
+    ABROAD,
+    EDGE,
+    MOST_CENTRES,
+    Fading,
+    FeatureDensity,
+    states_before_contacts,
+)
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
@@ -219,3 +226,21 @@ def test_the_share_outside_is_one_less_the_weight(model):
 def test_a_density_without_kernels_is_nowhere():
     density = FeatureDensity(0, 3)
     assert torch.equal(density(torch.rand(4, 3, dtype=torch.float64)), torch.zeros(4, 1, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("count", [20, 88, 120, 300])
+def test_further_flights_of_the_same_launcher_are_inside_however_many_trained(count):
+    """A flight changes on its way: one sample of each of many tracks must show all of it, and not the launch alone."""
+    rng = np.random.default_rng(4)
+
+    def flight() -> np.ndarray:
+        """(60, 3) features that run on from a launch."""
+        launch, way = rng.normal((0.2, 0.5, -0.3), 0.02), np.linspace(0.0, 1.0, 60)[:, None]
+        return launch + way * (0.4, -0.3, 0.5) + rng.normal(0.0, 0.005, (60, 3))
+
+    density = FeatureDensity.of([flight() for _ in range(count)], 3)
+    assert len(density.centres) <= MOST_CENTRES
+    weights = density(torch.tensor(np.array([flight() for _ in range(100)])))[..., 0].numpy()
+    for part in (weights[:, :20], weights[:, 20:40], weights[:, 40:]):
+        assert (part < 0.5).mean() < 3.0 * EDGE
+    assert float(density(torch.tensor([[0.2, 0.5, 0.6], [-0.6, 0.2, 0.0]])).max()) < 0.01  # elsewhere
