@@ -62,6 +62,8 @@ TEXT: Final = """\
                        time, time_sigma, there, spread)
      The next crossing of normal . p = offset (m) by the centre within `horizon` s: its time and the standard deviation
      of it (s), the state there and its covariance on the plane. direction: 1 along the normal, -1 against it, 0 either.
+     All balls are taken to cross on the mean's side of a contact: where others cross on the other side, time_sigma and
+     spread are too small (in Python, `crossing` of a forecast counts both); {p}_predict at that time counts both.
      Returns 1; 0: it does not cross; -1: a number is not finite, or the ball lands or bounces several times before.
 
    world[{world_size}]: m, height of the table and of the floor (-INFINITY: none), radius of the ball; the table's ends

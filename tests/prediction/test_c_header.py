@@ -24,8 +24,9 @@ from ballfg.dynamics.compiled.in_c.values import UntranslatableError
 from ballfg.dynamics.compiled.motion import Moving, fly_jacobian, world_of
 from ballfg.dynamics.model import BallModel
 from ballfg.factors.noise import ProcessNoise
-from ballfg.prediction import Belief, Propagator, plane_crossing
+from ballfg.prediction import BallState, Belief, Propagator, plane_crossing
 from ballfg.prediction.c_header import c_header
+from ballfg.prediction.state import World
 from tests.commands import status
 from tests.dynamics.compiled.test_networks import network, small
 from tests.places import DOCS
@@ -191,6 +192,21 @@ def test_crossings(in_c: InC, way: int, direction: str) -> None:
             close(there, right.state)
             close(spread, right.covariance)
     assert {0, 1} <= set(ends)
+
+
+def test_the_header_says_that_a_crossing_near_a_contact_counts_one_side_of_it(tmp_path: Path) -> None:
+    """Just after a bounce that some balls have not reached; `predict` and the `crossing` of a forecast count both."""
+    ball, state = InC(nominal_model(), tmp_path), np.array([-1.0, 0.1, 0.3, 4.0, 0.2, 1.0, 0.0, 60.0, 0.0])
+    covariance = np.diag(np.repeat((0.002, 0.03, 8.0), 3) ** 2)
+    end, (time, _, _, spread) = ball.cross(state, covariance, np.array([1.0, 0.0, 0.0]), 0.3, 1)
+    both = ball.predict(state, covariance, time)[2][0]
+    world = World(ball.model, SURFACES, NOISE)
+    crossing = BallState(0.0, state, covariance, world=world).predict(1.0).crossing(x=0.3)
+    assert end == 1
+    assert crossing is not None
+    for other in (both, crossing.covariance):
+        assert other[5, 5] > 25.0 * spread[5, 5]
+    assert "All balls are taken to cross on the mean's side of a contact" in ball.text
 
 
 def test_what_cannot_be_answered_is_said(in_c: InC) -> None:
