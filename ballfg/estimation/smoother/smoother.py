@@ -27,6 +27,7 @@ from ballfg.estimation.smoother.second_look.at_end import (
     from_before_a_bounce,
     log_evidence,
     with_both_sides,
+    with_hit_at_end,
     with_other_beginning,
 )
 from ballfg.estimation.smoother.second_look.low_hops import LowHops, counted, low_hops, uncounted_note, with_low_hops
@@ -294,7 +295,7 @@ class Smoother(Estimator):
             estimate = with_other_contacts(estimate, self.at_minimum(one.problem, one.solution, known), one.odds)
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
             return estimate
-        estimate = with_both_sides(self, problem, estimate)
+        estimate = with_hit_at_end(problem, with_both_sides(self, problem, estimate))
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
         hops = self.low_hops(problem.track, segmentation) if hops is None else hops

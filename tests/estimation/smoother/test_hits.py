@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
@@ -101,11 +101,7 @@ def struck_serves(rate: float, count: int) -> tuple[np.ndarray, np.ndarray, np.n
 def test_states_beside_a_hit_are_on_the_right_side_or_hold_both(rate: float, sigma: float) -> None:
     """By parabolas in closed form: the velocity jumps by 7 m/s at a moment that paths show to 0.2 ms."""
     times, moments, states = struck_serves(rate, 60)
-    model, settings = nominal_model(), Settings(position_noise=(sigma,) * 3)
-    with torch.no_grad():
-        for name in ("drag", "magnus"):
-            model.get_parameter(f"flight.{name}.k").zero_()
-    smoother, rng, wrong, odd = Smoother(model, Surfaces.none(), settings), np.random.default_rng(1), 0, []
+    smoother, rng, wrong, odd = Smoother(_in_vacuum(), Surfaces.none(), _exact(sigma)), np.random.default_rng(1), 0, []
     wide = list[bool]()
     for moment, true in zip(moments.tolist(), states, strict=True):
         estimate = smoother.estimate(Track(times, true[:, :3] + sigma * rng.standard_normal((len(times), 3))))
@@ -117,3 +113,33 @@ def test_states_beside_a_hit_are_on_the_right_side_or_hold_both(rate: float, sig
     assert wrong <= 4  # 0.2 ms before or after a stamp cannot be told
     assert np.max(odd) < 30.0  # of 6 numbers: one in 25,000
     assert np.mean(wide) < 0.15
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_a_track_that_ends_just_after_a_hit_does_not_claim_the_flight_before(samples: int) -> None:
+    """One or two samples cannot tell a hit from outliers; a track that ends before the hit is sure of its velocity."""
+    times, moments, states = struck_serves(100.0, 30)
+    smoother, rng, odd, sure = Smoother(_in_vacuum(), Surfaces.none(), _exact(0.002)), np.random.default_rng(2), [], []
+    for moment, true in zip(moments.tolist(), states, strict=True):
+        positions = true[:, :3] + 0.002 * rng.standard_normal((len(times), 3))
+        hit = int(np.searchsorted(times, moment, side="right"))  # the first sample after it
+        last = smoother.estimate(Track(times[: hit + samples], positions[: hit + samples]))[-1]
+        off = (last.state - np.append(true[hit + samples - 1], np.zeros(3)))[3:6]
+        odd.append(np.abs(off / np.sqrt(np.diag(last.joint))[3:6]).max())
+        before = smoother.estimate(Track(times[:hit], positions[:hit]))[-1]
+        sure.append(np.sqrt(np.diag(before.joint))[3:6].max())
+    # a hit less than 2 of the 10 ms before its first sample moved the ball by less than five standard deviations
+    assert np.mean(np.array(odd) > 4.0) < (0.35 if samples == 1 else 0.05)
+    assert np.max(sure) < 0.3
+
+
+def _in_vacuum() -> AnalyticModel:
+    model = nominal_model()
+    with torch.no_grad():
+        for name in ("drag", "magnus"):
+            model.get_parameter(f"flight.{name}.k").zero_()
+    return model
+
+
+def _exact(sigma: float) -> Settings:
+    return Settings(position_noise=(sigma,) * 3)

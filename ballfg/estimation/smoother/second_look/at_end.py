@@ -16,9 +16,10 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import bounced, gap_jacobian
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Quality
+from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.sides.hypotheses import HypothesisModel, measured_at
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, widening, with_contact_states
-from ballfg.estimation.smoother.problem import TrackProblem
+from ballfg.estimation.smoother.problem import QUALITY_SIGMA, TrackProblem
 from ballfg.estimation.smoother.settle import LEAST_FALL, Earlier, Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence
@@ -54,6 +55,38 @@ def with_both_sides(smoother: "Smoother", problem: TrackProblem, estimate: Estim
     found = {end - 1: _at_end(smoother, problem, estimate, begin, end) for begin, end in pairwise(edges)}
     states = {last: state for last, state in found.items() if state is not None}
     return with_contact_states(estimate, states) if states else estimate
+
+
+def with_hit_at_end(problem: TrackProblem, estimate: Estimate) -> Estimate:
+    """The estimate; where its last samples contradict the flight, their covariances hold that the ball may be struck.
+
+    Segmentation and smoother need two or three samples after a hit to tell it from outliers.
+    """
+    track, n = problem.track, len(estimate)
+    good = bool((estimate.quality[-REACH:] == Quality.GOOD).all())
+    if good or estimate.status.failed or track.rough or n <= REACH:
+        return estimate
+    from ballfg.estimation.sides.struck import HitDoubt
+
+    known = {contact.interval for contact in estimate.contacts} | set(estimate.hits.tolist())
+    doubt, found = HitDoubt(problem.settings, SegmentationSettings()), dict[int, Array]()
+    for k in range(n - REACH, n):
+        before, newest = estimate[k - 1], estimate[k]
+        if k - 1 in known or (newest.other_side is not None and newest.other_side.any()):
+            doubt.reset()
+        else:
+            states = (before.mean, before.joint), (newest.mean, newest.joint)
+            dt = newest.time - before.time
+            stated = problem.sigma[k] / QUALITY_SIGMA.get(Quality(estimate.quality[k]), 1.0)
+            found[k] = doubt.widened(states[0], dt, track.positions[k], stated, states[1])
+        if not doubt.contradicting:
+            found.clear()
+    if not found:
+        return estimate
+    covariances, cross = estimate.covariances.copy(), estimate.cross_covariances.copy()
+    for k, joint in found.items():
+        covariances[k], cross[k] = joint[:STATE_DIM, :STATE_DIM], joint[:STATE_DIM, STATE_DIM:]
+    return replace(estimate, covariances=covariances, cross_covariances=cross)
 
 
 def _at_end(
