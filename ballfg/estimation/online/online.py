@@ -245,20 +245,18 @@ class Online(Estimator):
         before = None if rebuilt else before
         contact = self._near_contact(before, newest)
         state = self._state(update, revised, rebuilt, status, contact)
-        return state if contact is not None else self._in_doubt_of_a_hit(state, before, newest)
+        return self._in_doubt_of_a_hit(state, None if contact is not None else before, newest)
 
     def _in_doubt_of_a_hit(self, state: OnlineState, before: tuple[Array, Array] | None, sample: Sample) -> OnlineState:
         """The newest state, its covariance widened where its sample may have followed a hit that nothing tells yet."""
         motion = sample.motion
-        known = before is None or not sample.measured or motion.hit or not motion.linked or motion.rest is not None
-        if known or not possible(state.state):
+        if before is None or not sample.measured or motion is not FLIGHT or not possible(state.state):
             self._hit.reset()
             return state
-        assert before is not None
-        dt = sample.time - self._samples[-2].time
-        return replace(
-            state, joint=self._hit.widened(before, dt, sample.position, sample.whole, (state.mean, state.joint))
-        )
+        assert self._monitor is not None
+        dt, measured = sample.time - self._samples[-2].time, (sample.position, sample.stated, sample.whole)
+        newest = (state.mean, state.joint)
+        return replace(state, joint=self._hit.widened(self._monitor.model, before, dt, measured, newest))
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""

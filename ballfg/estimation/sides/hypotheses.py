@@ -182,14 +182,21 @@ class HypothesisModel:
         """Balls after a measurement, and the least squared whitened innovation of the position."""
         nearest = 0.0
         if measured.position is not None:
-            H = np.zeros((3, balls.means.shape[1]))
-            H[:, POSITION], H[:, self.width :] = np.eye(3), np.eye(3)[:, : self.biases]
-            noise = np.diag(measured.sigma**2) + stamp_covariance(self.settings, balls.means[:, VELOCITY])
-            balls, squares = balls.updated(measured.position - balls.means @ H.T, noise, H)
+            balls, squares = balls.updated(*self.innovations(balls, measured.position, measured.sigma))
             nearest = float(squares.min())
         for factor in measured.factors:
             balls = balls.updated_by_factor(factor, self.biases)
         return balls, nearest
+
+    def innovations(self, balls: GaussianMixture, position: Array, sigma: Array) -> tuple[Array, Array, Array]:
+        """A measured position (3,) less those expected of balls (n, 3), its noise (n, 3, 3), and H (3, d).
+
+        Args: sigma: (3,) m, of its white error.
+        """
+        H = np.zeros((3, balls.means.shape[1]))
+        H[:, POSITION], H[:, self.width :] = np.eye(3), np.eye(3)[:, : self.biases]
+        noise = np.diag(sigma**2) + stamp_covariance(self.settings, balls.means[:, VELOCITY])
+        return position - balls.means @ H.T, noise, H
 
 
 def _at_nodes(balls: GaussianMixture) -> GaussianMixture:

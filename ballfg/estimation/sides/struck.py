@@ -14,7 +14,9 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.settings import Settings
-from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
+from ballfg.estimation.sides.gaussians import GaussianMixture
+from ballfg.estimation.sides.hypotheses import HypothesisModel
+from ballfg.state import POSITION, STATE_DIM
 
 AGREES: Final = 7.814728
 """Squared whitened distance in three dimensions below which a sample agrees with a flight: 95 % of good ones do."""
@@ -41,17 +43,26 @@ class HitDoubt:
         self.contradicting, self.elapsed = 0, 0.0
 
     def widened(
-        self, before: tuple[Array, Array], dt: float, position: Array, noise: Array, newest: tuple[Array, Array]
+        self,
+        model: HypothesisModel,
+        before: tuple[Array, Array],
+        dt: float,
+        measured: tuple[Array, Array, Array],
+        newest: tuple[Array, Array],
     ) -> Array:
         """(d, d) covariance of the newest state and coefficients about their means, with that of a struck ball.
 
         Args:
-            before: mean and covariance a sample ago, which begin with a state.  dt: s since then.
-            position: (3,) m, measured.  noise: (3,) m, its standard deviation.
+            model: of the ball and its measurement.
+            before: mean and covariance of state, coefficients and bias a sample ago.  dt: s since then.
+            measured: (3,) m, position, and standard deviations (3,) m of its white error and of its whole one.
             newest: mean (d,) and covariance (d, d) after the sample.
         """
+        position, white, whole = measured
         mean, covariance = newest
-        off, spread = _innovation(before, dt, position, noise)
+        flown = model.predict_flight(GaussianMixture.single(*before), dt)
+        (off,), noise, H = model.innovations(flown, position, white)
+        spread = H @ flown.covariances[0] @ H.T + noise[0]
         if off @ np.linalg.solve(spread, off) < AGREES:
             self.reset()
             return covariance
@@ -62,7 +73,7 @@ class HitDoubt:
         struck, own = np.zeros_like(covariance), slice(STATE_DIM)
         jump = np.zeros(STATE_DIM)
         jump[POSITION] = position - mean[POSITION]
-        sigmas = np.concatenate((noise, np.full(3, self.settings.velocity_prior), np.full(3, self.settings.spin_prior)))
+        sigmas = np.concatenate((whole, np.full(3, self.settings.velocity_prior), np.full(3, self.settings.spin_prior)))
         struck[own, own] = np.diag(sigmas**2) + np.outer(jump, jump)
         struck[STATE_DIM:, STATE_DIM:] = covariance[STATE_DIM:, STATE_DIM:]
         return (1.0 - chance) * covariance + chance * struck
@@ -81,17 +92,6 @@ class HitDoubt:
         )
         shares = np.exp(logs - logs.max())
         return float(shares[0] / shares.sum())
-
-
-def _innovation(before: tuple[Array, Array], dt: float, position: Array, noise: Array) -> tuple[Array, Array]:
-    """(3,) m, a measured position less that of a flight over dt s, and its covariance (3, 3)."""
-    mean, P = before
-    ahead = mean[POSITION] + dt * mean[VELOCITY]
-    ahead[Z] -= 0.5 * STANDARD_GRAVITY * dt**2
-    both = P[POSITION, VELOCITY]
-    spread = P[POSITION, POSITION] + dt * (both + both.T) + dt**2 * P[VELOCITY, VELOCITY]
-    spread.flat[:: len(noise) + 1] += noise**2
-    return position - ahead, spread
 
 
 def _log_density(off: Array, covariance: Array) -> float:

@@ -174,6 +174,20 @@ def test_states_just_after_a_hit_do_not_claim_the_flight_before(solver, rate):
     assert np.median(told) < 0.2
 
 
+@pytest.mark.parametrize("rate", [30.0, 60.0])
+def test_drag_and_spin_are_no_doubt_of_a_hit(rate):
+    """Between two samples drag and spin bend the path of a smash by up to 28 mm: its flight foresees that."""
+    model, rng, wide = nominal_model(), np.random.default_rng(5), []
+    for _ in range(4):
+        start = np.array([0.0, 0.0, 1.0, 25.0, rng.normal(), 2.0, 0.0, -150.0, 0.0])
+        online = Online(model, NOWHERE, settings(solver="ballfg"))
+        for k, x in enumerate(_flown(model, start, np.arange(20) / rate)):
+            state = online.push(k / rate, x[:3] + SIGMA * rng.standard_normal(3))
+            if k > 3:
+                wide.append(np.sqrt(np.diag(state.joint))[3:6].max())
+    assert max(wide) < 1.0
+
+
 def test_an_outlier_beyond_the_reach_of_a_hit_is_none():
     """At 500 Hz no hit moves a ball by half a metre within a sample."""
     track, _ = make_track(FLYING, n=60, surfaces=NOWHERE, dt=0.002)
