@@ -35,6 +35,7 @@ LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce
 TOP: Final = np.eye(STATE_DIM)[VZ]  # An apex is a fall of this line (9,) . state through zero
+UP: Final = np.eye(3)[2]  # Normal of the table's plane
 Carried: TypeAlias = tuple[Propagator, Belief]
 
 
@@ -64,7 +65,7 @@ def contact_ahead(path: "Path") -> tuple[Crossing | None, float]:
     """
     found, end = path.contact(), path.start.time + path.horizon
     chance = 0.0 if found is None else _sooner(found, end - found.time)
-    if _may_pass_an_end(path.start, path.carried[0].surfaces, found):
+    if _may_pass_an_end(path, found):
         found, chance = _past_or_not(path, found, chance)
     share, other = _other_contact(path, found)
     if other is not None:
@@ -76,14 +77,23 @@ def contact_ahead(path: "Path") -> tuple[Crossing | None, float]:
     return (None if found is None or found.time > end else found), chance
 
 
-def _may_pass_an_end(start: "BallState", surfaces: Surfaces, found: Crossing | None) -> bool:
-    """Whether some balls may come down on the table and others past its ends."""
-    if surfaces.extent is None or not start.state[Z] > surfaces.table_height:
+def _may_pass_an_end(path: "Path", found: Crossing | None, since: float = -math.inf, until: float = math.inf) -> bool:
+    """Whether some balls may come down on the table and others past its ends, before a time (s).
+
+    Args: found: the mean's first contact after a time `since`, s.
+    """
+    propagator, belief = path.carried
+    surfaces, (extent, top) = propagator.surfaces, (propagator.surfaces.extent, propagator.surfaces.table_height)
+    if extent is None or not path.start.state[Z] > top:
         return False
-    if found is None or not found.state[Z] > surfaces.table_height:
+    if found is None or not found.state[Z] > top:  # where the mean falls past the table, if it does
+        level = top + belief.model.radius
+        found = plane_crossing(*path.carried, UP, level, path.horizon + LATER, after=since, direction="down")
+    if found is None:
         return True
     near = FAR * np.hypot(np.sqrt(np.diagonal(found.covariance)[:2]).repeat(2), surfaces.edge_sigmas)
-    return bool((np.abs(found.state[:2].repeat(2) - surfaces.extent) < near).any())
+    sooner = found.time - FAR * found.time_sigma < until
+    return sooner and bool((np.abs(found.state[:2].repeat(2) - extent) < near).any())
 
 
 def _past_or_not(path: "Path", found: Crossing | None, chance: float) -> tuple[Crossing | None, float]:
@@ -236,7 +246,7 @@ class Path:
         Near a bounce some have it before and others after; some have had it just now, and have it again later or in
         the other direction; by an end of the table some meet the table and others do not.
         """
-        apart = self._just_now(line, offset) or self._by_an_end(found.time)
+        apart = self._just_now(line, offset) or self._by_an_end(found.time + FAR * found.time_sigma)
         if not (apart or self._near_a_bounce(found, line)):
             return found
         times, states, met = self._events(line, offset, direction, after)
@@ -260,15 +270,13 @@ class Path:
         return contact is not None and contact.time <= found.time + about
 
     def _by_an_end(self, until: float) -> bool:
-        """Whether the mean's contacts up to a time (s), or its fall past the table then, may be another ball's not."""
-        (propagator, _), since = self.carried, -np.inf
-        while propagator.surfaces.extent is not None and since < until:
+        """Whether by a time (s) some balls may meet the table where the mean falls past it, or the reverse."""
+        since = -np.inf
+        while since < until:
             contact = self.contact(since)
-            time = np.inf if contact is None else contact.time
-            past = contact is None or not contact.state[Z] > propagator.surfaces.table_height
-            if (past or time < until) and _may_pass_an_end(self.start, propagator.surfaces, contact):
+            if _may_pass_an_end(self, contact, since, until):
                 return True
-            since = time
+            since = np.inf if contact is None else contact.time
         return False
 
     def _events(self, line: Array, offset: float, direction: str, after: int) -> tuple[Array, Array, Array]:

@@ -280,6 +280,22 @@ def test_a_contact_near_the_end_of_a_table_is_that_of_balls_on_both_sides(world,
         assert told.crossing.time_sigma == pytest.approx(np.sqrt(np.square(when - told.crossing.time).mean()), rel=0.25)
 
 
+@pytest.mark.parametrize("far", [1.0, 60.0])
+def test_an_apex_high_above_the_way_to_a_table_end_is_that_of_the_noise(far):
+    """In vacuum, in closed form: white acceleration alone makes the apex uncertain; the end that comes later does not.
+
+    Args: far: m to the end of the table. The ball comes down beyond it, or on the table.
+    """
+    model, noise, rise = nominal_model(), ProcessNoise(acceleration=0.5), 0.25
+    with torch.no_grad():
+        for name in ("drag", "magnus"):
+            model.get_parameter(f"flight.{name}.k").zero_()
+    start = np.array([0.0, 0.0, 0.6, 6.0, 0.0, rise, 0.0, 0.0, 0.0])
+    surfaces = Surfaces(0.0, -0.76, (-2.0, far, -3.0, 3.0))
+    ball = BallState(0.0, start, np.diag([1e-6] * 6 + [1e-3] * 3) ** 2, (), World(model, surfaces, noise))
+    assert ball.predict(0.8).apex.time_sigma == pytest.approx(0.5 * np.sqrt(rise / G) / G, rel=0.01)
+
+
 @pytest.mark.parametrize("text", ["z=0.1,up", "z=0.1,down,after=1", "x=1.0,after=1", "z=-0.1,down", "x=1.0"])
 @pytest.mark.parametrize("end", [0.6, 0.64, 0.7])
 def test_a_crossing_by_the_end_of_a_table_is_that_of_the_balls_that_have_one(world, text, end):
