@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
-from ballfg.prediction.state import BallState
 
 GATE = 30.0  # Squared Mahalanobis distance, 3 degrees of freedom: one good position in a million exceeds it
 LONG_GATE = 16.0
@@ -36,9 +36,10 @@ class Known:
     covariance: Array  # (6, 6) of that, in the products of those units
 
     @classmethod
-    def of(cls, state: BallState) -> "Known":
-        """The belief of an estimated state."""
-        return cls(state.time, state.mean[:6], state.joint[:6, :6])
+    def of(cls, state: OnlineState) -> "Known":
+        """The belief of an estimated state in flight: a gate knows what a hit does."""
+        joint = state.joint if state.struck is None else state.joint - state.struck
+        return cls(state.time, state.mean[:6], joint[:6, :6])
 
 
 class Gate:

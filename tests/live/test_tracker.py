@@ -96,6 +96,21 @@ def test_two_balls_at_once_are_kept_apart(together: bool) -> None:
         same_state(of_ball(updates, number)[-1].state, expected[-1])
 
 
+@pytest.mark.parametrize("off", [0.06, 0.1, -0.1])
+def test_a_ball_that_may_have_been_hit_takes_no_sample_of_another(off: float) -> None:
+    """One sample of the first ball is off, and at the next stamp only the second one is seen, 0.3 m beside it."""
+    first, second = rows(shots(2)[0])[:13], rows(shots(2)[0], beside=0.3)[:13]
+    first[11, 3] += off
+    live, updates = tracker(), []
+    for one, other in zip(first[:12], second[:12], strict=True):
+        updates = live.push(one[0], np.stack((one, other))[:, 1:])
+    assert [update.ball for update in updates] == [1, 2]
+    (state,) = (update.state for update in updates if update.ball == 1)
+    assert state is not None
+    assert state.sigmas[3:6].max() > 3.0
+    assert [update.ball for update in live.push(second[12, 0], second[12, 1:])] == [2]
+
+
 def test_out_of_order_within_the_lag_equals_sorted() -> None:
     samples = rows(shots(1)[0])
     order = np.argsort(samples[:, 0] + np.random.default_rng(0).uniform(0.0, 0.09, len(samples)))

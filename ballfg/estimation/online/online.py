@@ -256,7 +256,8 @@ class Online(Estimator):
         assert self._monitor is not None
         dt, measured = sample.time - self._samples[-2].time, (sample.position, sample.stated, sample.whole)
         newest = (state.mean, state.joint)
-        return replace(state, joint=self._hit.widened(self._monitor.model, before, dt, measured, newest))
+        joint = self._hit.widened(self._monitor.model, before, dt, measured, newest)
+        return state if joint is state.joint else replace(state, joint=joint, struck=joint - state.joint)
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""

@@ -151,6 +151,7 @@ class OnlineState(BallState):
         evaluated: number of evaluated factors of the motion.  calls: number of torch calls for them.
         rebuilt: True if iSAM2 failed and the window was rebuilt.
         status: OK, or a remedy.
+        struck: (9 + p, 9 + p) part of the covariance for the chance that the ball was hit just before, or None.
     """
 
     innovation: Array
@@ -160,3 +161,4 @@ class OnlineState(BallState):
     calls: int
     rebuilt: bool
     status: Status
+    struck: Array | None = None
