@@ -295,7 +295,7 @@ class Smoother(Estimator):
             estimate = with_other_contacts(estimate, self.at_minimum(one.problem, one.solution, known), one.odds)
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
             return estimate
-        estimate = with_hit_at_end(problem, with_both_sides(self, problem, estimate))
+        estimate = with_hit_at_end(self, problem, with_both_sides(self, problem, estimate))
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
         hops = self.low_hops(problem.track, segmentation) if hops is None else hops

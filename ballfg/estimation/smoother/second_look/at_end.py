@@ -57,7 +57,7 @@ def with_both_sides(smoother: "Smoother", problem: TrackProblem, estimate: Estim
     return with_contact_states(estimate, states) if states else estimate
 
 
-def with_hit_at_end(problem: TrackProblem, estimate: Estimate) -> Estimate:
+def with_hit_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
     """The estimate; where its last samples contradict the flight, their covariances hold that the ball may be struck.
 
     Segmentation and smoother need two or three samples after a hit to tell it from outliers.
@@ -69,16 +69,17 @@ def with_hit_at_end(problem: TrackProblem, estimate: Estimate) -> Estimate:
     from ballfg.estimation.sides.struck import HitDoubt
 
     known = {contact.interval for contact in estimate.contacts} | set(estimate.hits.tolist())
+    model = HypothesisModel(problem.ball, smoother.surfaces, problem.settings)
     doubt, found = HitDoubt(problem.settings, SegmentationSettings()), dict[int, Array]()
     for k in range(n - REACH, n):
         before, newest = estimate[k - 1], estimate[k]
         if k - 1 in known or (newest.other_side is not None and newest.other_side.any()):
             doubt.reset()
         else:
-            states = (before.mean, before.joint), (newest.mean, newest.joint)
-            dt = newest.time - before.time
-            stated = problem.sigma[k] / QUALITY_SIGMA.get(Quality(estimate.quality[k]), 1.0)
-            found[k] = doubt.widened(states[0], dt, track.positions[k], stated, states[1])
+            sigma = problem.sigma[k] / QUALITY_SIGMA.get(Quality(estimate.quality[k]), 1.0)
+            beliefs = [(state.mean, state.joint) for state in (before, newest)]
+            measured = (track.positions[k], sigma, sigma)
+            found[k] = doubt.widened(model, beliefs[0], newest.time - before.time, measured, beliefs[1])
         if not doubt.contradicting:
             found.clear()
     if not found:
