@@ -180,7 +180,7 @@ class Observation(ABC):
             f"the measurements '{self.name}' lie {far:.2g} times as far from the motion as they state"
             f"{f' ({each})' if each else ''}: covariances are too small. Check {self.causes}."
         )
-        return replace(estimate, notes=(*estimate.notes, note))
+        return estimate if note in estimate.notes else replace(estimate, notes=(*estimate.notes, note))
 
     def _parts(self, estimate: "Estimate") -> Mapping[str, float]:
         """The same figure of each source of the measurements, by its name; by default of none."""

@@ -1,8 +1,8 @@
 """Finds the path of a ball that was seen from one point: bounces and gravity give the depth that rays lack.
 
 At a guessed time the ball bounces where the ray then meets a surface, with flights before and after it
-(`bounced_path`). The time of a bounce is scanned, and the smallest misfit counts; a further bounce is taken if it fits
-much better. Without a bounce, gravity gives the scale.
+(`bounced_path`). The time of a bounce is scanned, and so is that of a further one while it fits much better. Without a
+bounce, gravity gives the scale. All these paths are starts; how often the ball bounced is a question to their evidence.
 """
 
 from dataclasses import dataclass, replace
@@ -19,18 +19,21 @@ from ballfg.estimation.segmentation.result import Contact
 from ballfg.state import Z
 
 STEPS: Final = 0.25  # Of the camera's period, between guessed times of a bounce; the smoother finds the time itself
+SPIN: Final = 0.12, 0.12, 0.45
+"""1/s, as `LIFT`, of a ball that flies any way: of 40 rad/s aside and 150 of topspin, as `Settings.one_view_spin`."""
 WIDEST: Final = 1.0
 """m, largest standard deviation that is stated of a rough position: what is beyond is not known at all."""
 LEAST_STEP: Final = 4e-3  # s, least of these steps
 MOST_STEPS: Final = 2000  # Guessed times of a bounce; a track that is longer than 8 s may have longer steps
 ENOUGH: Final = 60  # Sightings that show the bounces: of more, some are left out
-PRICE: Final = 10.0  # Twice the log likelihood that a bounce must gain over a path without it
+PRICE: Final = 10.0  # Twice the log likelihood that a bounce must gain over a path without it, to be tried before it
 BETTER: Final = 1.15  # Factor by which a further bounce must lower the misfit: spin bends flights too, but less
-POOR: Final = 20.0
-"""Misfit for each sighting from which the first bounces may be wrong, and are scanned again beside a further one."""
+POOR: Final = 3.0
+"""Misfit for each sighting, of which noise leaves two, from which the first bounces may be wrong, and are scanned again
+beside a further one."""
 MOST_BOUNCES: Final = 4
 RIVAL: Final = 50.0
-"""Twice the log likelihood by which a bounce between two other samples may fit worse and is tried all the same."""
+"""Twice the log likelihood by which another path may fit worse and is tried all the same."""
 MOST_RIVALS: Final = 3
 APART: Final = 0.009  # s, least time between the bounces of rivals: the smoother moves a bounce from sample to sample
 
@@ -55,23 +58,25 @@ class OneView:
 
 
 def one_view(rays: Rays, moments: Array, physics: SegmentationPhysics, surfaces: Surfaces) -> list[OneView]:
-    """The likely paths, best first; the others have a bounce in another interval, or one bounce less.
+    """The likely paths, best first: with bounces in other intervals, with fewer bounces, and with one more.
 
     Args: rays: of all sightings.  moments: (n,) s, of the track's samples.  physics: of the ball.  surfaces: to meet.
     """
     rays = rays.thinned(ENOUGH)
-    middle = np.array([[float(np.median(rays.times))]])
-    table = Scene(rays, physics, surfaces, surfaces.table_height)
-    flight = solved(table, middle, 0)
+    table = Scene(rays, physics, surfaces, surfaces.table_height, SPIN)
+    middle, still = np.array([[float(np.median(rays.times))]]), replace(table, lift=None)
+    flight = _path(still, solved(still, middle, 0), 0, moments)  # beside spin, gravity does not give the scale
+    offers = [(float(solved(table, middle, 0).misfit[0]), flight)]
     for height in surfaces.heights():  # the floor only gets what cannot be on the table: farther and faster look alike
         scene = replace(table, height=height)
-        found = _bounced(scene, moments)
-        if found and found[-1][1].min() + PRICE < flight.misfit[0]:
-            tried, misfit = found[-1]
+        for tried, misfit, rivals in _bounced(scene, moments):
             rows = _rivals(misfit, tried.times, np.searchsorted(moments, tried.times, side="right"))
-            fewer = [_path(scene, few, int(np.argmin(fit)), moments) for few, fit in found[-2:-1]]
-            return [*(_path(scene, tried, row, moments) for row in rows), *fewer]
-    return [_path(table, flight, 0, moments)]
+            priced = misfit + PRICE * tried.bounces
+            offers += [(float(priced[row]), _path(scene, tried, row, moments)) for row in rows[: 1 + rivals]]
+        offers.sort(key=lambda offer: offer[0])
+        if offers[0][1].bounces:
+            break
+    return [path for priced, path in offers if priced <= offers[0][0] + RIVAL]
 
 
 def bounced_at(rays: Rays, moments: Array, physics: SegmentationPhysics, surfaces: Surfaces, bounces: Array) -> OneView:
@@ -81,24 +86,28 @@ def bounced_at(rays: Rays, moments: Array, physics: SegmentationPhysics, surface
     return _path(scene, solved(scene, times[None], len(bounces)), 0, moments)
 
 
-def _bounced(scene: Scene, moments: Array) -> list[tuple[Paths, Array]]:
-    """Paths with one bounce at all guessed times and misfits (k,); then those with more, while they fit better."""
+def _bounced(scene: Scene, moments: Array) -> list[tuple[Paths, Array, int]]:
+    """Paths with one bounce at all guessed times, and misfits (k,); then those with more, while they fit better.
+
+    Then those with one more, if any are possible. The last number says how many rivals of the best are worth a trial.
+    """
     if len(moments) < 2:
         return []
     span = float(moments[-1] - moments[0])
     step = max(STEPS * float(np.median(np.diff(moments))), LEAST_STEP, span / MOST_STEPS)
     guesses = np.arange(moments[0] + step, moments[-1] - 0.5 * step, step)
     further = guesses[(guesses > moments[1]) & (guesses < moments[-2])]  # a flight of one sample explains anything
-    found, least, poor = list[tuple[Paths, Array]](), np.inf, POOR * len(scene.rays.times)
+    found, least, poor = list[tuple[Paths, Array, int]](), np.inf, POOR * len(scene.rays.times)
     more = _one_more(scene, np.zeros(0), guesses)
     while more is not None:
         for number in range(more[0].bounces if least > poor else 0):  # the others again, beside the new one
             again = _one_more(scene, np.delete(_best(*more), number), guesses)
             more = again if again is not None and again[1].min() < more[1].min() else more
         if BETTER * more[1].min() + PRICE < least:
-            found, least = [*found, more], float(more[1].min())
+            found = [*((*one[:2], 0) for one in found), (*more, MOST_RIVALS)]
+            least = float(more[1].min())
         elif found:
-            break
+            return [*found, (*more, 0)] if np.isfinite(more[1]).any() else found
         more = _one_more(scene, _best(*more), further) if more[0].bounces < MOST_BOUNCES else None
     return found
 

@@ -229,16 +229,20 @@ class CameraSightings(Observation):
         mean[:, POSITION], root[0, :, POSITION] = self.place[0], np.eye(3) / self.place[1]
         return [PriorFactors(np.zeros(1, dtype=np.int64), mean, root)]
 
+    def lines(self, positions: Array) -> tuple[Array, Array]:
+        """Directions (n, 3) and distances (n,) m from the cameras to positions (n, 3) m of the track's samples."""
+        first = np.searchsorted(self.state, np.arange(len(positions)))
+        centres = np.stack([camera.centre for camera in self.cameras])[self.sightings.camera[first]]
+        rays = self.sightings.select(first).from_cameras(positions) - centres
+        distance = np.linalg.norm(rays, axis=1)
+        return rays / distance[:, None], distance
+
     def judged(self, estimate: Estimate) -> Estimate:
         """The estimate, with the status `DEPTH_UNCERTAIN` if one camera saw the ball and its depth is loose."""
         estimate = super().judged(estimate)
         if not self.one_view or estimate.status is not Status.OK:
             return estimate
-        first = np.searchsorted(self.state, np.arange(len(estimate)))
-        centres = np.stack([camera.centre for camera in self.cameras])[self.sightings.camera[first]]
-        rays = self.sightings.select(first).from_cameras(estimate.states[:, POSITION]) - centres
-        distance = np.linalg.norm(rays, axis=1)
-        rays /= distance[:, None]
+        rays, distance = self.lines(estimate.states[:, POSITION])
         sigma = np.sqrt(np.einsum("ni,nij,nj->n", rays, estimate.covariances[:, POSITION, POSITION], rays))
         loose = np.median(sigma) > LOOSE_DEPTH or np.median(sigma / distance) > LOOSE_SHARE
         return replace(estimate, status=Status.DEPTH_UNCERTAIN) if loose else estimate

@@ -18,6 +18,7 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
 from ballfg.estimation.observations.positions import Positions
+from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.smoother.motion import TrackDynamics
@@ -171,6 +172,12 @@ class TrackProblem:
             for one, count in counts.items()
             if count
         )
+
+    def judged(self, estimate: Estimate) -> Estimate:
+        """The estimate, with what each observation says of it."""
+        for observation in self.observations:
+            estimate = observation.judged(estimate)
+        return estimate
 
     def start(self, states: Array) -> Values:
         """Initial values: states (n, 9), the model's own coefficients, unknowns and biases of zero."""

@@ -11,7 +11,7 @@ search starts again; the lower minimum is the result.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -35,6 +35,9 @@ from ballfg.factors.linear.covariance import Covariances, marginal_covariances
 from ballfg.factors.prior import PriorFactors, SpinLabelFactors
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.estimation.smoother.second_look.depths import Depths
 
 ROUGH = 1e-2
 """Posterior standard deviations. Minima of this accuracy show the places of contacts and hits; only the last one is
@@ -68,7 +71,9 @@ class Solution:
     rival: Array | None = None
     """(3,) rad/s, first spin of another minimum that is nearly as low, if any."""
     others: tuple["Other", ...] = ()
-    """With other numbers of contacts in gaps, nearly as probable."""
+    """With other numbers of contacts in gaps, or before one camera, nearly as probable."""
+    depths: "Depths | None" = None
+    """Of a ball without contacts before one camera: its paths at all distances."""
 
 
 class Other(NamedTuple):

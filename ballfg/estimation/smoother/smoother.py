@@ -1,6 +1,6 @@
 """The smoother finds the most probable states of a whole track by Levenberg-Marquardt on its factor graph."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -114,7 +114,7 @@ class Smoother(Estimator):
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
             problem, *rivals = smoother.problems(track.since_first())  # as `solved`, which would lengthen the way
-            problem, solution = smoother.lowest(problem, smoother.settle(problem), rivals)
+            problem, solution = smoother.likeliest(problem, smoother.settle(problem), rivals)
             problem, solution = smoother.bridged(problem, solution)
             found = smoother.result(problem, solution)
             estimate = found.dated(track.times)
@@ -175,12 +175,12 @@ class Smoother(Estimator):
         return [self.problem(start) for start in starts]
 
     def solved(self, track: Track) -> tuple[TrackProblem, Solution]:
-        """The problem with the lowest minimum among those of a track's starts, and its solution.
+        """The most probable problem among those of a track's starts, and its solution.
 
         Args: track: prepared, with stamps since its first.
         """
         problem, *rivals = self.problems(track)
-        return self.bridged(*self.lowest(problem, self.settle(problem), rivals))
+        return self.bridged(*self.likeliest(problem, self.settle(problem), rivals))
 
     def bridged(self, problem: TrackProblem, solution: Solution) -> Solved:
         """The problem and its solution, or those with a more probable number of contacts in gaps between samples."""
@@ -190,15 +190,13 @@ class Smoother(Estimator):
 
         return bridged(self, problem, solution)
 
-    def lowest(
-        self, problem: TrackProblem, solution: Solution, rivals: Iterable[TrackProblem]
-    ) -> tuple[TrackProblem, Solution]:
-        """A problem with its solution, or a rival with its own if that is lower."""
-        for rival in rivals:
-            other = self.settle(rival)
-            if other.minimum.error < solution.minimum.error:
-                problem, solution = rival, other
-        return problem, solution
+    def likeliest(self, problem: TrackProblem, solution: Solution, rivals: Sequence[TrackProblem]) -> Solved:
+        """A problem with its solution, or the most probable of its rivals with its own."""
+        if not problem.one_view:
+            return problem, solution
+        from ballfg.estimation.smoother.second_look.explanations import most_probable  # of one camera's tracks
+
+        return most_probable(self, (problem, solution), rivals)
 
     def problem(
         self, track: Track, segmentation: Segmentation | None = None, sigma: Array | None = None
@@ -283,18 +281,16 @@ class Smoother(Estimator):
         if rival is not None and odds < 0.0:
             others = tuple(one._replace(odds=one.odds - odds) for one in others)
             (problem, solution), rival, odds = rival, (problem, solution), -odds
-        known = self.optimizer.covariances(solution.graph, solution.minimum)
-        estimate = self.at_minimum(problem, solution, known)
+        estimate = self.explained(problem, solution)
         if rival is not None:
-            other = self.at_minimum(*rival, self.optimizer.covariances(rival[1].graph, rival[1].minimum))
-            estimate = with_other_beginning(estimate, other, odds)
+            estimate = with_other_beginning(estimate, self.explained(*rival), odds)
         for one in others:
-            from ballfg.estimation.smoother.second_look.gaps import with_other_contacts
+            from ballfg.estimation.smoother.second_look.explanations import with_explanation
 
-            known = self.optimizer.covariances(one.solution.graph, one.solution.minimum)
-            estimate = with_other_contacts(estimate, self.at_minimum(one.problem, one.solution, known), one.odds)
+            other = self.explained(one.problem, one.solution)
+            estimate = with_explanation(estimate, other, one.odds, one_view=problem.one_view)
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
-            return estimate
+            return problem.judged(estimate)
         estimate = with_hit_at_end(self, problem, with_both_sides(self, problem, estimate))
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
@@ -302,6 +298,12 @@ class Smoother(Estimator):
         uncounted = uncounted_note(hops, problem.track.times)
         estimate = replace(estimate, notes=estimate.notes + uncounted) if uncounted else estimate
         return with_low_hops(estimate, hops, self.model)
+
+    def explained(self, problem: TrackProblem, solution: Solution) -> Estimate:
+        """The estimate by one explanation of a track, over all distances that it leaves open to one camera."""
+        known = self.optimizer.covariances(solution.graph, solution.minimum)
+        estimate = self.at_minimum(problem, solution, known)
+        return estimate if solution.depths is None else problem.judged(solution.depths.onto(estimate))
 
     def at_minimum(self, problem: TrackProblem, solution: Solution, known: Covariances | None) -> Estimate:
         """The estimate at a minimum, before a second look at the end of the track and at low hops.
@@ -344,8 +346,7 @@ class Smoother(Estimator):
             notes=(*self.doubts(track), *problem.notes(solution.events)),
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
-        for observation in problem.observations:
-            estimate = observation.judged(estimate)
+        estimate = problem.judged(estimate)
         rival = rival_note(solution, estimate.covariances[0])
         estimate = replace(estimate, notes=estimate.notes + rival) if rival else estimate
         return widened_near_contacts(estimate, problem.ball, segmentation.restarts)

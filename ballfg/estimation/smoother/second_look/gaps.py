@@ -61,11 +61,13 @@ def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> So
     """
     longest, best, solved = _longest_step(problem.track), (problem, solution), dict[Key, Solved]()
     near = {gap: found for gap in _gaps(*best, longest) if (found := _near(smoother, *best, gap, longest))}
+    if not near:
+        return best
     if len(near) > 1:  # beside a wrong number in one gap, the right one in another may seem less probable
         together = _events_of(solution)
         for gap, (likeliest, *_) in near.items():
             together = _spliced(together, likeliest, gap)
-        best = max(best, _settled(smoother, best, together, near, solved) or best, key=_evidence)
+        best = max(best, _settled(smoother, best, together, near, solved) or best, key=evidence)
     for _ in range(PASSES if len(near) > 1 else 1):  # beside another number, other numbers may be in doubt
         others, before = list[Solved](), best
         for gap, explanations in near.items():
@@ -73,13 +75,13 @@ def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> So
                 other = _settled(smoother, best, _spliced(_events_of(best[1]), events, gap), [gap], solved)
                 if other is None:
                     continue
-                other, best = sorted((other, best), key=_evidence)
+                other, best = sorted((other, best), key=evidence)
                 if not _alike(_events_of(other[1]), _events_of(best[1]), gap):
                     others.append(other)
         if best is before:
             break
-    highest = _evidence(best)
-    rivals = (Other(*other, highest - _evidence(other)) for other in others)
+    highest = evidence(best)
+    rivals = (Other(*other, highest - evidence(other)) for other in others)
     return best[0], replace(best[1], others=tuple(one for one in rivals if one.odds < APART))
 
 
@@ -153,9 +155,7 @@ class _Local:
 
     def __post_init__(self) -> None:
         self.apart = self.smoother.segment(self.track, self.longest)
-        calm = replace(self.smoother.settings, find_events=False)  # a wrong number would ask for hits
-        quick = replace(self.smoother.optimizer, max_iterations=QUICK, tolerance=ROUGH)
-        self.calm = Smoother(self.smoother.model, self.smoother.surfaces, calm, quick)
+        self.calm = calmed(self.smoother)
 
     def likely(self, *counts: int) -> Iterator[Segmentation]:
         """The events of the most probable explanation, then of those that are nearly as probable.
@@ -176,8 +176,15 @@ class _Local:
             start = _with_contacts(self.apart, self.track, self.smoother.surfaces, self.gap, count)
             problem = self.calm.problem(self.track, start)
             solved = problem, self.calm.settle(problem)
-            self.explained[count] = _evidence(solved), _events_of(solved[1])
+            self.explained[count] = evidence(solved), _events_of(solved[1])
         return self.explained[count][0]
+
+
+def calmed(smoother: Smoother, most_steps: int = QUICK) -> Smoother:
+    """A smoother that explains a track roughly: without hits, for which a wrong number of contacts would ask."""
+    calm = replace(smoother.settings, find_events=False)
+    quick = replace(smoother.optimizer, max_iterations=most_steps, tolerance=ROUGH)
+    return Smoother(smoother.model, smoother.surfaces, calm, quick)
 
 
 def _with_contacts(apart: Segmentation, track: Track, surfaces: Surfaces, gap: int, count: int) -> Segmentation:
@@ -260,8 +267,11 @@ def _inside(contacts: Sequence[Contact], gap: int) -> int:
     return sum(contact.interval == gap for contact in contacts)
 
 
-def _evidence(solved: Solved) -> float:
-    """nats, less the prices of contacts and hits; -inf without a minimum."""
+def evidence(solved: Solved, whole: float | None = None) -> float:
+    """nats, less the prices of contacts and hits; -inf without a minimum.
+
+    Args: whole: the evidence of all paths of these events, if it is known better than by `log_evidence`.
+    """
     problem, solution = solved
     if solution.minimum.step is None:
         return -math.inf
@@ -269,10 +279,10 @@ def _evidence(solved: Solved) -> float:
     price = USUAL.contact_cost * len(events.contacts)
     for step in np.diff(problem.track.times)[events.segmentation.hits].tolist():
         price += hit_price(USUAL.hit_rate, USUAL.hit_cost, USUAL.short_gap, step)
-    return log_evidence(solution) - price
+    return (log_evidence(solution) if whole is None else whole) - price
 
 
-def with_other_contacts(estimate: Estimate, other: Estimate, odds: float) -> Estimate:
+def with_other_contacts(estimate: Estimate, other: Estimate, odds: float, note: str = UNSURE) -> Estimate:
     """The estimate with covariances that hold another one's states too, and a note; odds: log, of its own."""
     chance = 1.0 / (1.0 + math.exp(max(odds, 0.0)))
     if not chance > CERTAIN:
@@ -281,5 +291,5 @@ def with_other_contacts(estimate: Estimate, other: Estimate, odds: float) -> Est
     for k, near in enumerate(estimate.covariances):
         far, jump = other.covariances[k], other.states[k] - estimate.states[k]
         covariances[k] += widening(near, far, jump, chance)
-    notes = estimate.notes if UNSURE in estimate.notes else (*estimate.notes, UNSURE)
+    notes = estimate.notes if note in estimate.notes else (*estimate.notes, note)
     return replace(estimate, covariances=covariances, notes=notes)
