@@ -158,8 +158,9 @@ def test_the_mean_of_paths_and_their_covariance() -> None:
     np.testing.assert_allclose(found.weights, [0.75, 0.25])
     assert found.evidence == pytest.approx(math.log((1.0 + 1.0 / 3.0) * 0.5))
     assert found.sigma == pytest.approx(0.5 * math.sqrt(0.75 * 0.25))
-    mixed = found.onto(estimate)
+    mixed = found.onto(replace(estimate, status=Status.NOT_CONVERGED))
     assert mixed.status is Status.OK
+    assert found.onto(replace(estimate, status=Status.DEPTH_UNCERTAIN)).status is Status.DEPTH_UNCERTAIN
     np.testing.assert_allclose(mixed.states, 1.0)
     np.testing.assert_allclose(mixed.covariances[0], np.eye(9) + 3.0)
     np.testing.assert_allclose(mixed.coefficient_covariance, 2.0 * np.eye(p) + 3.0)

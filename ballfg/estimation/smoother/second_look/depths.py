@@ -84,6 +84,7 @@ class Depths:
         mean = np.einsum("k,kni->ni", weights, points)
         inside += np.einsum("k,kni,knj->nij", weights, points - mean, points - mean)
         reached = weights @ [path.reached for path in self.paths] > 0.5
+        loose = estimate.status is Status.DEPTH_UNCERTAIN  # what the most probable path leaves open is not sure
         return replace(
             estimate,
             states=mean[:, :STATE_DIM],
@@ -91,7 +92,7 @@ class Depths:
             cross_covariances=inside[:, :STATE_DIM, STATE_DIM:],
             coefficients=mean[0, STATE_DIM:],
             coefficient_covariance=inside[0, STATE_DIM:, STATE_DIM:],
-            status=Status.OK if reached else estimate.status,
+            status=estimate.status if loose or not reached else Status.OK,
         )
 
 
