@@ -14,7 +14,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.motion.contact import gaps
-from ballfg.estimation.observations.sightings import CameraSightings
+from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import log_evidence
@@ -117,8 +117,7 @@ def log_prior_of_size(problem: TrackProblem, values: Values) -> float:
     Paths of one picture differ in their size, which grows with the distance. Flat priors alone make one the more
     probable, the larger it is: by the volumes of places and of velocities.
     """
-    sightings = next(one for one in problem.observations if isinstance(one, CameraSightings))
-    return -6.0 * math.log(float(sightings.lines(values.states[:, POSITION])[1][0]))
+    return -6.0 * math.log(float(sightings_of(problem.track).lines(values.states[:, POSITION])[1][0]))
 
 
 class _Search:
@@ -126,7 +125,7 @@ class _Search:
 
     def __init__(self, smoother: Smoother, problem: TrackProblem, solution: Solution) -> None:
         self.smoother, self.problem, self.solution = smoother, problem, solution
-        self.sightings = next(one for one in problem.observations if isinstance(one, CameraSightings))
+        self.sightings = sightings_of(problem.track)
         self.middle, values = len(problem.track) // 2, solution.minimum.values
         rays, distances = self.sightings.lines(values.states[:, POSITION])
         self.ray, self.distance = rays[self.middle], float(distances[self.middle])
