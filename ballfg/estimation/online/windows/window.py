@@ -246,7 +246,7 @@ class IsamWindow(StreamWindow):
         stacked, point, graph = gtsam.GaussianFactorGraph(), self._point(0), gtsam.NonlinearFactorGraph()
         for factor in alone.values():
             stacked.push_back(factor.linearize(point))
-        triangle = np.linalg.qr(stacked.augmentedJacobian(), mode="r")[: self.p]
+        triangle = np.linalg.qr(stacked.augmentedJacobian()).R[: self.p]
         merged = linear_factor([COEFFICIENT_KEY], [triangle[:, :-1]], triangle[:, -1], point)
         graph.push_back(merged)
         (slot,) = self._update(graph, gtsam.Values(), list(alone), {}, self._keys())
@@ -256,7 +256,8 @@ class IsamWindow(StreamWindow):
         """Replaces the link of a state's bias to the one before by the prior of a bias."""
         graph, sample = gtsam.NonlinearFactorGraph(), self.samples[k]
         graph.push_back(bias_start(STATE_KEY + self.first + k, self.settings))
-        slots = self._update(graph, gtsam.Values(), [sample.bias_slot], {}, self._keys())
+        link = [] if sample.bias_slot is None else [sample.bias_slot]
+        slots = self._update(graph, gtsam.Values(), link, {}, self._keys())
         sample.slots, sample.bias_slot = (*sample.slots, *slots), None
         self._read_back()
 
