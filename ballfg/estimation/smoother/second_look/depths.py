@@ -41,7 +41,6 @@ class Held(NamedTuple):
     free: float  # nats, chance that nothing is
     values: Values
     known: Covariances
-    reached: bool  # True if they are at a minimum
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,6 @@ class Depths:
             inside[:, STATE_DIM:, STATE_DIM:] += weight * path.known.coefficients[:p, :p]
         mean = np.einsum("k,kni->ni", weights, points)
         inside += np.einsum("k,kni,knj->nij", weights, points - mean, points - mean)
-        reached = weights @ [path.reached for path in self.paths] > 0.5
         loose = estimate.status is Status.DEPTH_UNCERTAIN  # what the most probable path leaves open is not sure
         return replace(
             estimate,
@@ -92,7 +90,7 @@ class Depths:
             cross_covariances=inside[:, :STATE_DIM, STATE_DIM:],
             coefficients=mean[0, STATE_DIM:],
             coefficient_covariance=inside[0, STATE_DIM:, STATE_DIM:],
-            status=estimate.status if loose or not reached else Status.OK,
+            status=estimate.status if loose else Status.OK,
         )
 
 
@@ -184,12 +182,12 @@ class _Search:
         states[:, VELOCITY] *= scale
         minimum = self.rough.minimize(held, replace(near, states=states))
         known = self.smoother.optimizer.covariances(held, minimum)
-        if known is None:
+        if known is None or minimum.convergence not in AT_MINIMUM:  # elsewhere a determinant says nothing of a volume
             return None
         density = log_evidence(replace(self.solution, graph=held, minimum=minimum))
         density += log_prior_of_size(self.problem, minimum.values) - math.log(HELD * math.sqrt(2.0 * math.pi))
         free = self.log_chance(minimum.values.states, known)
-        return Held(density, free, minimum.values, known, minimum.convergence in AT_MINIMUM)
+        return Held(density, free, minimum.values, known)
 
     def log_chance(self, states: Array, known: Covariances) -> float:
         """nats, of a path that meets no surface at its samples: at the lowest of them."""
