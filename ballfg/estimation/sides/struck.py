@@ -16,6 +16,7 @@ from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.estimation.sides.hypotheses import HypothesisModel
+from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.state import POSITION, STATE_DIM
 
 AGREES: Final = 7.814728
@@ -63,7 +64,7 @@ class HitDoubt:
         flown = model.predict_flight(GaussianMixture.single(*before), dt)
         (off,), noise, H = model.innovations(flown, position, white)
         spread = H @ flown.covariances[0] @ H.T + noise[0]
-        if off @ np.linalg.solve(spread, off) < AGREES:
+        if not variances_positive(spread) or off @ np.linalg.solve(spread := definite(spread), off) < AGREES:
             self.reset()
             return covariance
         self.contradicting, self.elapsed = self.contradicting + 1, self.elapsed + dt
