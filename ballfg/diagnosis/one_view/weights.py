@@ -20,6 +20,7 @@ from ballfg.diagnosis.evidence.odds import Odds
 from ballfg.diagnosis.evidence.prior import WIDTHS, log_odds
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import Score
+from ballfg.estimation.sides.gaussians import log_density
 
 CLIPPED: Final = 3.5
 """Robust standard deviations from the median beyond which a stroke's score counts no more: a stroke of which a wrong
@@ -153,7 +154,7 @@ class Weights:
             sigmas = np.ones(len(places))
             sigmas[self.declared :] = np.repeat(widths, [len(group) for group in own])
             root = columns * sigmas
-            found.append((_log_density(left, self.spread + root @ root.T), sigmas))
+            found.append((log_density(left, self.spread + root @ root.T), sigmas))
         evidence = float(special.logsumexp([value for value, _ in found]) - np.log(len(found)))
         sigmas = max(found, key=lambda one: one[0])[1]
         inverse = np.linalg.inv(self.spread)
@@ -233,9 +234,3 @@ def mean_of(real: Array, again: Sequence[Array]) -> tuple[Array, Array]:
     size = float(np.trace(np.linalg.solve(shape, np.atleast_2d(np.cov(found.T))))) / len(shape)
     spread = shape * (max(1.0, size) / len(found) + 1.0 / sum(len(one) for one in others))
     return found.mean(axis=0) - middle, spread
-
-
-def _log_density(value: Array, covariance: Array) -> float:
-    root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, value)
-    return float(-0.5 * white @ white - np.log(np.diagonal(root)).sum())

@@ -98,3 +98,10 @@ class GaussianMixture:
     def divided(self, log_weight: float) -> "GaussianMixture":
         """The mixture with all weights divided by one, given by its logarithm."""
         return replace(self, log_weights=self.log_weights - log_weight)
+
+
+def log_density(off: Array, covariance: Array) -> float:
+    """Logarithm of a normal density (d,) away from its mean, without the constant that depends on d alone."""
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, off)
+    return float(-0.5 * white @ white - np.log(np.diagonal(root)).sum())

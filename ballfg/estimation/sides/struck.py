@@ -14,7 +14,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.sides.gaussians import GaussianMixture
+from ballfg.estimation.sides.gaussians import GaussianMixture, log_density
 from ballfg.estimation.sides.hypotheses import HypothesisModel
 from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.state import POSITION, STATE_DIM
@@ -86,15 +86,10 @@ class HitDoubt:
         way = self.settings.velocity_prior * self.elapsed
         logs = np.array(
             [
-                math.log(struck) + _log_density(off, spread + way**2 / 3.0 * np.eye(3)),  # at any moment since then
-                k * math.log(priors.outlier_share) + _log_density(off, spread + priors.outlier_spread**2 * np.eye(3)),
-                _log_density(off, spread),
+                math.log(struck) + log_density(off, spread + way**2 / 3.0 * np.eye(3)),  # at any moment since then
+                k * math.log(priors.outlier_share) + log_density(off, spread + priors.outlier_spread**2 * np.eye(3)),
+                log_density(off, spread),
             ]
         )
         shares = np.exp(logs - logs.max())
         return float(shares[0] / shares.sum())
-
-
-def _log_density(off: Array, covariance: Array) -> float:
-    """Logarithm of a normal density of three numbers, up to a constant."""
-    return float(-0.5 * (off @ np.linalg.solve(covariance, off) + np.linalg.slogdet(covariance)[1]))

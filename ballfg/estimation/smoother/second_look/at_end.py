@@ -16,7 +16,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import bounced, gap_jacobian
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Quality
-from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.estimation.segmentation.segmenter import USUAL
 from ballfg.estimation.sides.hypotheses import HypothesisModel, measured_at
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, widening, with_contact_states
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, TrackProblem
@@ -70,7 +70,7 @@ def with_hit_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Estim
 
     known = {contact.interval for contact in estimate.contacts} | set(estimate.hits.tolist())
     model = HypothesisModel(problem.ball, smoother.surfaces, problem.settings)
-    doubt, found = HitDoubt(problem.settings, SegmentationSettings()), dict[int, Array]()
+    doubt, found = HitDoubt(problem.settings, USUAL), dict[int, Array]()
     for k in range(n - REACH, n):
         before, newest = estimate[k - 1], estimate[k]
         if k - 1 in known or (newest.other_side is not None and newest.other_side.any()):

@@ -17,7 +17,7 @@ from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import Solved
 from ballfg.estimation.smoother.second_look.depths import log_prior_of_size, over_depths
 from ballfg.estimation.smoother.second_look.gaps import APART, calmed, evidence, with_other_contacts
-from ballfg.estimation.smoother.settle import Other, Solution, places_of, spans_of, timed_contacts
+from ballfg.estimation.smoother.settle import Other, Solution, arrangement_of, spans_of, timed_contacts
 from ballfg.estimation.smoother.smoother import Smoother
 
 OPEN: Final = "how the ball bounced is not certain: covariances hold what is nearly as probable"
@@ -34,25 +34,21 @@ def most_probable(smoother: Smoother, first: Solved, rivals: Sequence[TrackProbl
 
     Args: first: the problem of the likeliest start, with its solution.  rivals: of the other starts.
     """
-    calm, best = calmed(smoother, FEW_STEPS), {_key(first): _weighed(smoother, first)}
+    start, calm = arrangement_of(first[1].events), calmed(smoother, FEW_STEPS)
+    best = {start: _weighed(smoother, first)}
     tried = [(rival, calm.settle(rival)) for rival in rivals]
     rough = [(_roughly(one) if one[1].events.contacts else math.inf, one) for one in tried]
-    highest = best[_key(first)][0]
+    highest = best[start][0]
     for found, one in sorted(rough, key=lambda known: -known[0]):
-        if found > highest - APART and _key(one) not in best:
+        if found > highest - APART and arrangement_of(one[1].events) not in best:
             solved = one[0], smoother.settle(one[0])
-            if _key(solved) not in best:
-                best[_key(solved)] = _weighed(smoother, solved)
-                highest = max(highest, best[_key(solved)][0])
+            here = arrangement_of(solved[1].events)
+            if here not in best:
+                best[here] = _weighed(smoother, solved)
+                highest = max(highest, best[here][0])
     (highest, (problem, solution)), *rest = sorted(best.values(), key=lambda known: -known[0])
     others = tuple(Other(*solved, highest - found) for found, solved in rest if found > highest - APART)
     return problem, replace(solution, others=others)
-
-
-def _key(solved: Solved) -> tuple[tuple[tuple[int, float], ...], tuple[int, ...]]:
-    """The places of all contacts, and the hits: what tells one explanation from another."""
-    events = solved[1].events
-    return places_of(events.contacts), tuple(events.segmentation.hits.tolist())
 
 
 def _roughly(solved: Solved) -> float:
