@@ -113,7 +113,8 @@ def log_prior_of_size(problem: TrackProblem, values: Values) -> float:
     """nats, beside flat priors of the first place and velocity: all sizes of a path are as probable (Jeffreys).
 
     Paths of one picture differ in their size, which grows with the distance. Flat priors alone make one the more
-    probable, the larger it is: by the volumes of places and of velocities.
+    probable, the larger it is: by the volumes of places and of velocities. Measured strokes of three views and
+    simulated ones chose it among four priors; other simulated ones, from behind, beside and above, judged it.
     """
     return -6.0 * math.log(float(sightings_of(problem.track).lines(values.states[:, POSITION])[1][0]))
 
