@@ -34,8 +34,6 @@ from ballfg.tracks.noise import TrackNoise
 from ballfg.tracks.track import level_of
 
 TRACKS_FOR_NOISE = 50  # Number of tracks for the estimate of the measurement noise when a dataset does not state it
-QUICK_TRACKS = 20
-"""Number of tracks for all other noise, spread over the first `TRACKS_FOR_TABLE`, which may be of several groups."""
 KEPT = 8  # Number of datasets whose noise is cached: their tracks may be estimated one by one
 LEAST_TRACKS = 5  # Least number of tracks that shows how much tracks differ
 FEW_TRACKS = "too few tracks to show their noise: that of bounces and coefficients is the usual one"
@@ -164,7 +162,7 @@ def _content(model: BallModel) -> Hashable:
 
 def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float, watch: Watch) -> Settings | None:
     """The settings with the noise estimated from the tracks; None if the tracks do not determine it."""
-    chosen = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
+    chosen = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE))
     parts = [track.opening(observed) for track in chosen]
     surfaces, before = dataset_surfaces(dataset), dataset_settings(dataset, model)
     known = dataset.info.position_noise is not None

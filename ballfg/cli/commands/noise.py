@@ -50,7 +50,7 @@ def noise(
     model: inputs.ModelFile = None,
     effects_file: inputs.EffectsFiles = None,
     observations_file: inputs.ObservationsFiles = None,
-    tracks: Annotated[int, typer.Option(min=5, help="Number of tracks that are used, evenly over the dataset.")] = 20,
+    tracks: Annotated[int, typer.Option(min=5, help="Number of tracks that are used, evenly over the dataset.")] = 80,
     out: Annotated[
         Path | None, typer.Option(metavar="<path>", help="Model file to write: the model with this noise.")
     ] = None,
@@ -63,8 +63,8 @@ def noise(
     From detections it is the noise of each camera's pixels, beside the stated one.
 
     It is the noise with which forecasts 20 to 300 ms ahead, within the tracks, are most probable. The model stays as it
-    is: an effect that it lacks counts as noise. `estimate` and `predict` do the same on fewer tracks where neither
-    dataset.yaml nor the model states the noise.
+    is: an effect that it lacks counts as noise. `estimate` and `predict` do the same where neither dataset.yaml nor the
+    model states the noise.
 
     Example: ballfg noise data/ballgun --out noisy.yaml
     """
