@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 PAIRS: Final = 64  # Least number of pairs of possible balls, opposite about the mean; shares are right to some 0.03
 STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is right to 0.2 mm after one
-SPANS: Final = 6  # Number of parts of the horizon in which a possible ball has a random acceleration each
+SPANS: Final = 8
+"""Number of parts of the horizon in which a possible ball has a random acceleration each. A later part is longer: none
+may last longer than the time before it, else balls lie too close together in it."""
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce
@@ -201,11 +203,12 @@ class Path:
         noise, surfaces, d = density_of(propagator.noise), propagator.surfaces, belief.mean.shape[1]
         pairs = max(PAIRS, d)
         steps = max(math.ceil(horizon / STEP - 1e-9), 1)
-        spans = np.arange(steps) * min(SPANS, steps) // steps  # of lasting pushes, by step
+        ends = np.maximum(np.geomspace(1, steps, min(SPANS, steps)).round(), 1.0 + np.arange(min(SPANS, steps)))
+        spans = np.searchsorted(ends, np.arange(steps), side="right")  # of lasting pushes, by step
         h, lasting = horizon / steps, np.bincount(spans)
-        kicks, ends, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
+        kicks, sides, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
         pushes = pushed.reshape(2 * pairs, SPANS, 3)[:, : len(lasting)] * (noise[0] / np.sqrt(h * lasting))[:, None]
-        off = ends * surfaces.edge_sigmas if any(surfaces.edge_sigmas) else np.zeros_like(ends)
+        off = sides * surfaces.edge_sigmas if any(surfaces.edge_sigmas) else np.zeros_like(sides)
         start = _placed(belief, normal_points(pairs, d) @ root_of(belief.covariance[0].detach().numpy()).T, surfaces)
         chance = (pushes[:, spans], kicks * noise[[3, 3, 2]], off)
         return Scattered.of(belief.model, start, h, chance, surfaces)

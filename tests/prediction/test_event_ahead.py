@@ -396,6 +396,25 @@ def test_possible_balls_have_the_noise_of_the_motion(world, mean):
     assert np.unique(balls.met[:, -1]).tolist() == [float(mean is FALLING)]
 
 
+def test_possible_balls_have_the_noise_of_the_motion_from_the_first_steps_on(world):
+    """However far the horizon: white acceleration gives a variance that grows with time, a lasting one with its square.
+
+    A position is off by an eighth at the end of the first step, which has one push.
+    """
+    ball = BallState(
+        0.0,
+        np.array([0.0, 0.0, 50.0, 3.0, 0.5, 1.0, 0.0, 0.0, 0.0]),
+        1e-16 * np.eye(9),
+        (),
+        World(world.model, Surfaces(0.0), ProcessNoise(acceleration=0.1)),
+    )
+    balls = Path(ball, carried_by(ball), 3.0).possible
+    for moment in (3, 6, 15, 30):
+        t = float(balls.times[0, moment])
+        there = np.sqrt(np.diagonal(ball.predict(t, t).covariances[-1]))[:6]
+        assert balls.states[:, moment, :6].std(axis=0) == pytest.approx(there, rel=0.2)
+
+
 def test_a_ball_that_rolls_falls_off_the_end(world):
     """It neither hops nor has an apex; every ball gets to the end within the horizon, or none does."""
     height = 0.02 + float(world.model.surface_offset(torch.zeros(1, 9, dtype=torch.float64)))
