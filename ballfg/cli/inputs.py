@@ -1,6 +1,5 @@
 """Opens the dataset, model and estimator that a command line names, for estimate and predict."""
 
-import enum
 import math
 import sys
 from collections.abc import Iterable, Iterator
@@ -98,15 +97,8 @@ DATASET_TABLES = ("tracks", "labels", "detections", "truth")
 """Names, without their endings, of the tables in a dataset's folder."""
 
 
-class Source(enum.StrEnum):
-    """Sources of an estimate, by the name of the option."""
-
-    POSITIONS = "positions"
-    DETECTIONS = "detections"
-
-
 SourceName = Annotated[
-    Source | None,
+    Literal["positions", "detections"] | None,
     typer.Option(
         "--from",
         help="Input: positions of tracks, or camera detections (detections.csv with cameras.yaml).",
@@ -118,7 +110,7 @@ D = TypeVar("D", bound="Dataset | SightedDataset")
 
 @dataclass(frozen=True)
 class Inputs(Generic[D]):
-    """A dataset, of positions or of sightings, with model and surfaces."""
+    """A dataset, of positions or of sightings, with model and surfaces, and the doubts that were printed."""
 
     dataset: D
     model: "BallModel"
@@ -132,13 +124,12 @@ class Inputs(Generic[D]):
         Args: anyway: True for a dataset that hardly holds any flight.
         Raises: ValueError: for such a dataset otherwise.
         """
-        from ballfg.estimation.flights.dataset import in_flight
         from ballfg.tracks import Dataset
 
-        data = self.dataset
-        if not isinstance(data, Dataset):
+        if not isinstance(self.dataset, Dataset):
             return self
-        return replace(self, dataset=flights_only(data, anyway), doubts=(*self.doubts, *in_flight(data).lines))
+        found = flights_only(self.dataset, anyway)
+        return replace(self, dataset=found.dataset, doubts=(*self.doubts, *found.lines))
 
     def estimator(self, method: str, solver: "Solver | None" = None, group: str | None = None) -> "Estimator":
         """The estimator of a name, with the noise of the dataset.
@@ -166,13 +157,13 @@ class Inputs(Generic[D]):
 
 
 def flights_only(data: "Dataset", anyway: bool) -> Any:
-    """The flights of a dataset, after what is said about the rest; errors as of `Inputs.in_flight`."""
+    """What flies in a dataset (`InFlight`), after what is said about the rest; errors as of `Inputs.in_flight`."""
     from ballfg.estimation.flights.dataset import in_flight
 
     found = in_flight(data)
     print_doubts(found.lines)
     found.check(data.path, anyway)
-    return found.dataset
+    return found
 
 
 def filtered(data: "Dataset | SightedDataset") -> tuple[str, ...]:
@@ -237,7 +228,7 @@ def open_sighted(
 
 
 def open_source(
-    source: Source | None,
+    source: str | None,
     dataset: Path,
     model: Path | None,
     effects_files: Iterable[Path] | None = None,
@@ -250,11 +241,11 @@ def open_source(
     return open_inputs(dataset, model, effects_files, observed, ball)
 
 
-def is_sighted(source: Source | None, dataset: Path) -> bool:
+def is_sighted(source: str | None, dataset: Path) -> bool:
     """True for detections; without a source, where there is no table of positions but one of detections."""
     from ballfg.estimation.reading import has_positions
 
-    return not has_positions(dataset) if source is None else source is Source.DETECTIONS
+    return not has_positions(dataset) if source is None else source == "detections"
 
 
 def open_model(data: "Dataset | SightedDataset", model: Path | None, ball: str | None = None) -> "BallModel":

@@ -1,12 +1,11 @@
 """Implements `ballfg calibrate-cameras`: images of a board and points of the table give `cameras.yaml`."""
 
-import enum
 import json
 import re
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
@@ -28,20 +27,13 @@ _lens_option, _place_option = (
 )
 
 
-class BoardKind(enum.StrEnum):
-    """Boards whose corners can be found."""
-
-    CHESSBOARD = "chessboard"
-    CHARUCO = "charuco"
-
-
 def calibrate_cameras(
     out: Annotated[Path, typer.Option(help="Output camera file: .yaml, or .xml or .json for OpenCV.")],
     images: Annotated[
         list[str] | None,
         _lens_option(help="Board images of a camera, NAME=PLACE: a folder, pattern or file; may be repeated."),
     ] = None,
-    board: Annotated[BoardKind, _lens_option(help="Kind of board.")] = BoardKind.CHESSBOARD,
+    board: Annotated[Literal["chessboard", "charuco"], _lens_option(help="Kind of board.")] = "chessboard",
     squares: Annotated[str, _lens_option(help="Number of squares, columns x rows, with the outermost: 10x7.")] = "",
     square: Annotated[float, _lens_option(help="Side of a square, m.")] = 0.0,
     marker: Annotated[float, _lens_option(help="Side of a ChArUco marker, m.")] = 0.0,
@@ -134,14 +126,14 @@ def _check_same(
         raise ValueError(f"{here} names camera {name!r}, which {there} does not. Add it there, or leave it out.")
 
 
-def _board(kind: BoardKind, squares: str, square: float, marker: float, dictionary: str, legacy: bool) -> "Board":
+def _board(kind: str, squares: str, square: float, marker: float, dictionary: str, legacy: bool) -> "Board":
     from ballfg.vision.calibration.boards import Charuco, Chessboard
 
     match = re.fullmatch(r"(\d+)x(\d+)", squares)
     if match is None:
         raise ValueError(f"--squares must be squares in a row x rows, as 10x7; got {squares!r}. Count them.")
     columns, rows = int(match[1]), int(match[2])
-    if kind is BoardKind.CHESSBOARD:
+    if kind == "chessboard":
         return Chessboard(columns, rows, square)
     return Charuco(columns, rows, square, marker, dictionary.upper().removeprefix("DICT_"), legacy)
 

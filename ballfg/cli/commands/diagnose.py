@@ -106,7 +106,7 @@ def _typed(
     effects: Sequence[Path] | None,
     observations: Sequence[Path] | None,
     name_at: float,
-    source: inputs.Source | None,
+    source: str | None,
     out: Path,
 ) -> str:
     """The command line, without options that do not change the result."""
@@ -115,7 +115,7 @@ def _typed(
     words += [word for path in effects or () for word in ("--effects-file", str(path))]
     words += [word for path in observations or () for word in ("--observations-file", str(path))]
     words += [] if name_at == NAME_AT else ["--name-at", f"{name_at:g}"]
-    words += [] if source is None else ["--from", source.value]
+    words += [] if source is None else ["--from", source]
     return shlex.join([*words, "--out", str(out)])
 
 

@@ -108,11 +108,9 @@ def _estimated(model: "BallModel", estimator: "Estimator", track: "Track") -> _E
         columns.append(own if share is None else own | {"outside": share})
         shares += [] if share is None else [float(share.sum())]
         notes += part.notes
-        rows, hits, flying = (
-            rows + len(part.times),
-            hits + len(part.hits),
-            flying + int((part.labels == Label.FLIGHT).sum()),
-        )
+        rows += len(part.times)
+        hits += len(part.hits)
+        flying += int((part.labels == Label.FLIGHT).sum())
         status = part.status if status is None or part.status.failed else status
     outside = sum(shares) / rows if shares else None
     assert status is not None

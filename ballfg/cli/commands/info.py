@@ -113,17 +113,12 @@ def balls() -> None:
 
     Example: ballfg balls
     """
-    for line in _ball_lines():
-        typer.echo(line)
-
-
-def _ball_lines() -> Iterator[str]:
     from ballfg.dynamics import nominal_model
     from ballfg.dynamics.known_balls import KNOWN_BALLS
     from ballfg.dynamics.model_file import model_to_dict
 
     titles = ("name", "radius mm", "mass g", "drag k 1/m", "terminal m/s", "restitution", "court m")
-    yield f"{titles[0]:<13}" + "".join(f"{title:>14}" for title in titles[1:]) + "  radius and mass by"
+    typer.echo(f"{titles[0]:<13}" + "".join(f"{title:>14}" for title in titles[1:]) + "  radius and mass by")
     for name, known in KNOWN_BALLS.items():
         model = model_to_dict(nominal_model(name))
         drag, gravity = model["flight"]["drag"]["k"], model["flight"]["gravity"]["g"]
@@ -135,7 +130,7 @@ def _ball_lines() -> Iterator[str]:
             f"{model['bounce']['restitution']['e']:.3g}",
             "-" if known.court is None else "{:g} x {:g}".format(*known.court),
         )
-        yield f"{name:<13}" + "".join(f"{number:>14}" for number in numbers) + f"  {known.source}"
+        typer.echo(f"{name:<13}" + "".join(f"{number:>14}" for number in numbers) + f"  {known.source}")
 
 
 def effects(

@@ -87,7 +87,7 @@ def noise(
         inputs.check_model_out(out)
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
-    data = inputs.flights_only(data, anyway)
+    data = inputs.flights_only(data, anyway).dataset
     surfaces, chosen = dataset_surfaces(data), spread_over(data, len(data), tracks)
     assumed, usual = dataset_settings(data, ball), usual_settings(data, ball)
     found = estimate_noise(ball, surfaces, usual, chosen, watch=progress)

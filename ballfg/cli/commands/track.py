@@ -1,12 +1,11 @@
 """Implements `ballfg track`, which turns videos of calibrated cameras into tracks."""
 
-import enum
 import os
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,16 +16,9 @@ if TYPE_CHECKING:
     from ballfg.simulation.balls import BallKind
     from ballfg.vision import Camera
     from ballfg.vision.detection.detections import Detections
-    from ballfg.vision.detection.detector import Colour as BallColour
+    from ballfg.vision.detection.detector import Colour
     from ballfg.vision.tracking.dataset import Streams
     from ballfg.vision.tracking.pipeline import Tracking
-
-
-class Colour(enum.StrEnum):
-    """Colours of the ball, by the name of the option."""
-
-    WHITE = "white"
-    ORANGE = "orange"
 
 
 def track(
@@ -58,7 +50,7 @@ def track(
     time_offsets: Annotated[
         bool, typer.Option("--time-offsets", help="Estimate each camera's time offset from the first camera.")
     ] = False,
-    colour: Annotated[Colour | None, typer.Option(help="Ball colour; by default any.")] = None,
+    colour: Annotated[Literal["white", "orange"] | None, typer.Option(help="Ball colour; by default any.")] = None,
     detector: Annotated[str | None, typer.Option(help="Custom detector, FILE.py:NAME.")] = None,
     ball: Annotated[str, typer.Option(help="Ball: table-tennis, tennis, or a ball file (YAML).")] = "table-tennis",
     table_height: Annotated[
@@ -252,7 +244,7 @@ def _from_videos(
     recordings: Sequence[str],
     rig: "Sequence[Camera]",
     stamps: Sequence[str],
-    colour: Colour | None,
+    colour: "Colour | None",
     detector: str | None,
     jobs: int | None,
     without: Sequence[str],
@@ -266,7 +258,7 @@ def _from_videos(
     videos, files = match_videos(recordings, rig, without), stamp_files(stamps, rig)
     if detector is not None and colour is not None:
         raise ValueError("--colour must not be given with --detector: it is about ballfg's own. Leave one of them out.")
-    settings = DetectorSettings(colour=cast("BallColour | None", colour))
+    settings = DetectorSettings(colour=colour)
     make = partial(learn_detector, settings=settings) if detector is None else load_detector(detector)
     found = detect_videos(videos, rig, make, stamps=files, jobs=jobs or len(rig), watch=progress)
     return found, [open_video(path, files.get(name)).frames for name, path in videos.items()]
