@@ -39,15 +39,12 @@ class Recordings:
 
     Attributes:
         tracks: as they were recorded.  flights: those of each track; the track itself if nothing else is in it.
-        share: of the samples that are flight, 0 to 1.  smoothing, others, repeated: as of `InFlight`.
+        contents: of all tracks.
     """
 
     tracks: Sequence[Track]
     flights: Sequence[Sequence[Track]]
-    share: float
-    smoothing: float
-    others: str
-    repeated: str
+    contents: Contents
 
     @property
     def cut(self) -> list[Track]:
@@ -63,22 +60,23 @@ class Recordings:
         """The line of the proposal, where something else than flight is in the tracks. Args: chosen: cut them."""
         if not self.mixed:
             return None
-        rest = f"{int(100 * self.share)} % of the samples fly; in the others the ball is held, rolls, rests or is lost"
+        share = int(100 * self.contents.share)
+        rest = f"{share} % of the samples fly; in the others the ball is held, rolls, rests or is lost"
         if chosen:
             return Guess("flights", f"{len(self.cut)}, from {self.mixed} tracks", rest, "stated", "")
         return Guess("flights", "left in their tracks", rest, "likely", "--flights")
 
     def doubts(self, frame: Frame, cut: bool) -> list[str]:
         """Sentences for `dataset.yaml`. Args: frame: the units.  cut: True if only flights are kept."""
-        said = list[str]()
-        if self.share < ENOUGH:
+        said, share = list[str](), self.contents.share
+        if share < ENOUGH:
             said.append(
-                f"{'the flights were cut from tracks of which ' if cut else ''}only {100 * self.share:.0f} % of the "
+                f"{'the flights were cut from tracks of which ' if cut else ''}only {100 * share:.0f} % of the "
                 f"samples fall like a ball, in {frame.length} and {frame.time} with {frame.up} up: check units and axis"
             )
-        if self.smoothing > SMOOTHED:
-            said.append(smoothed(self.smoothing))
-        said += filter(None, [self.others, self.repeated])
+        if self.contents.smoothing > SMOOTHED:
+            said.append(smoothed(self.contents.smoothing))
+        said += filter(None, [self.contents.others, self.contents.repeated])
         if len(self.cut) < LEAST_TRACKS:
             said.append(FEW_TRACKS)
         return [*said, *clipped(self.tracks)]
@@ -107,7 +105,7 @@ def recordings(tracks: Sequence[Track]) -> Recordings:
     found = Contents.of(labelled, lambda _, labels: flies_throughout(labels))
     pieces = (found.pieces[track.name] for track in tracks)
     flights = [[track] if own is None else tracks_of(track, own) for track, own in zip(tracks, pieces, strict=True)]
-    return Recordings(tracks, flights, found.share, found.smoothing, found.others, found.repeated)
+    return Recordings(tracks, flights, found)
 
 
 MOST_QUESTIONS: Final = 8  # Largest number of questions about one source; with more, something else is wrong
@@ -172,7 +170,11 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     recorded = recordings(tracks)
     height, height_guess, table_doubt = table_of(tracks, recorded.cut, ball, choices)
     flights_guess = recorded.guess(choices.flights)
-    tracks = _flights(recorded) if choices.flights else tracks
+    if choices.flights and not recorded.cut:
+        raise ValueError(
+            "--flights must find flights; nothing in the tracks flies like a ball. Check units and up axis."
+        )
+    tracks = recorded.cut if choices.flights else tracks
     rate = float(f"{1.0 / np.median(np.concatenate([np.diff(track.seconds) for track in tracks])):.4g}")
     guesses = [*_column_guesses(roles), *guesses, height_guess, split_guess, ball_guess]
     guesses += [] if flights_guess is None else [flights_guess]
@@ -198,15 +200,6 @@ def _unseen(roles: Roles) -> list[str]:
     if not axes:
         return []
     return [f"{' and '.join(axes)} of the source {'are' if len(axes) > 1 else 'is'} not measured and set to zero"]
-
-
-def _flights(recorded: Recordings) -> list[Track]:
-    """The flights of all tracks. Raises: ValueError: there are none."""
-    if not recorded.cut:
-        raise ValueError(
-            "--flights must find flights; nothing in the tracks flies like a ball. Check units and up axis."
-        )
-    return recorded.cut
 
 
 def _tracks(

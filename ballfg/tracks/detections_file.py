@@ -156,6 +156,15 @@ def read_columns(path: Path, required: Sequence[str]) -> tuple[list[str], dict[s
     return header, {name: _texts(path, name, table.column(name)) for name in texts}, values
 
 
+def read_candidates(path: Path, required: Sequence[str]) -> tuple[list[str], dict[str, Texts], dict[str, Array]]:
+    """`read_columns` of candidates: cells checked, scores 0 to 1, and what is not stated filled in; errors as there."""
+    header, texts, values = read_columns(path, required)
+    count = len(values["t"])
+    check_values(path, values, np.arange(count), {**RULES, SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))})
+    unstated = UNSTATED | {SCORE: 1.0}  # somebody has chosen them
+    return header, texts, {name: np.full(count, value) for name, value in unstated.items()} | values
+
+
 def _texts(path: Path, name: str, column: pa.ChunkedArray) -> Texts:
     """(n,) names of balls, which may be missing, or of cameras."""
     words, codes = distinct(column.unify_dictionaries().combine_chunks())
@@ -226,25 +235,23 @@ def covariances(values: Mapping[str, Array]) -> Array:
 
 def radii_of(values: Mapping[str, Array]) -> Array:
     """(n, 2) px, the ball's radius in the picture and its sigma; 0 and any sigma where a table has none."""
-    (count,) = {len(column) for column in values.values()}
-    radius, sigma = (
-        values.get(name, np.full(count, value)) for name, value in zip(RADIUS, (0.0, UNSTATED["sigma_u"]), strict=True)
-    )
-    return np.stack((radius, sigma), axis=1)
+    return _stated(values, dict(zip(RADIUS, (0.0, UNSTATED["sigma_u"]), strict=True)))
 
 
 def streaks_of(values: Mapping[str, Array]) -> Array:
     """(n, 2) px, from one end of the ball's streak to the other; 0 where a table has none."""
-    (count,) = {len(column) for column in values.values()}
-    return np.stack([values.get(name, np.zeros(count)) for name in STREAK], axis=1)
+    return _stated(values, dict.fromkeys(STREAK, 0.0))
 
 
 def shifts_of(values: Mapping[str, Array]) -> Array | None:
     """(n, 3) m, where cameras stood from their places; None where a table does not say that they moved."""
+    return _stated(values, dict.fromkeys(SHIFT, 0.0)) if any(name in values for name in SHIFT) else None
+
+
+def _stated(values: Mapping[str, Array], unstated: Mapping[str, float]) -> Array:
+    """(n, k) columns of a table, each with the number that stands for it where the table has none."""
     (count,) = {len(column) for column in values.values()}
-    if not any(name in values for name in SHIFT):
-        return None
-    return np.stack([values.get(name, np.zeros(count)) for name in SHIFT], axis=1)
+    return np.stack([values.get(name, np.full(count, value)) for name, value in unstated.items()], axis=1)
 
 
 def seen_columns(

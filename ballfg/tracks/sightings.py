@@ -51,13 +51,7 @@ class Sightings:
             problem = f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {shown(camera.tolist())}"
             raise ValueError(f"{problem}. Number the cameras in the order of their names.")
         object.__setattr__(self, "camera", camera.astype(np.int64))
-        for field, shape in {"times": (m,), "pixels": (m, 2), "covariances": (m, 2, 2)}.items():
-            array = check_array(field, getattr(self, field), shape, "Pass one row per sighting.")
-            if not np.isfinite(array).all():
-                row = int(np.argwhere(~np.isfinite(array))[0][0])
-                raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
-            object.__setattr__(self, field, array)
-        self._check_cues(m)
+        self._check_arrays(m)
         for number, name in enumerate(self.cameras):
             rows = np.flatnonzero(self.camera == number)
             wrong = np.flatnonzero(np.diff(self.times[rows]) <= 0.0)
@@ -75,8 +69,22 @@ class Sightings:
                 f"{self.covariances[row].tolist()}. Give the variance of u and v in px^2."
             )
 
-    def _check_cues(self, m: int) -> None:
-        """Checks radii, streaks and shifts of m sightings. Raises: ValueError."""
+    def _check_arrays(self, m: int) -> None:
+        """Checks and converts the arrays of numbers of m sightings. Raises: ValueError."""
+        for field, shape, remedy in (
+            ("times", (m,), "Drop that sighting"),
+            ("pixels", (m, 2), "Drop that sighting"),
+            ("covariances", (m, 2, 2), "Drop that sighting"),
+            ("streaks", (m, 2), "Give 0 for unknown"),
+            ("shifts", (m, 3), "Give 0 for none"),
+        ):
+            if getattr(self, field) is None:
+                continue
+            array = check_array(field, getattr(self, field), shape, "Pass one row per sighting.")
+            if not np.isfinite(array).all():
+                row = int(np.argwhere(~np.isfinite(array))[0][0])
+                raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. {remedy}.")
+            object.__setattr__(self, field, array)
         if self.radii is not None:
             radii = check_array("radii", self.radii, (m, 2), "Pass one row per sighting.")
             good = np.isfinite(radii).all(axis=1) & (radii[:, 0] >= 0.0) & (radii[:, 1] > 0.0)
@@ -85,14 +93,6 @@ class Sightings:
                 problem = f"radii must be a radius and a sigma above zero, in px; radii[{row}]={radii[row].tolist()}"
                 raise ValueError(f"{problem}. Give 0 for an unknown radius.")
             object.__setattr__(self, "radii", radii)
-        for field, width, remedy in (("streaks", 2, "Give 0 for unknown"), ("shifts", 3, "Give 0 for none")):
-            if getattr(self, field) is None:
-                continue
-            cues = check_array(field, getattr(self, field), (m, width), "Pass one row per sighting.")
-            if not np.isfinite(cues).all():
-                row = int(np.argwhere(~np.isfinite(cues))[0][0])
-                raise ValueError(f"{field} must be finite; {field}[{row}]={cues[row].tolist()}. {remedy}.")
-            object.__setattr__(self, field, cues)
 
     def __len__(self) -> int:
         return len(self.times)

@@ -17,7 +17,7 @@ import numpy as np
 from ballfg.arrays import Array, Mask
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.court import Court
-from ballfg.vision.broadcast.lines import moved, slopes
+from ballfg.vision.broadcast.lines import moved, sampled, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole, posed
 
 SHORTEST: Final = 0.02
@@ -46,8 +46,6 @@ DISTANCES: Final = (1.0, 60.0)
 """Of the court's half length."""
 ALONG: Final = 2.0
 """Ratio of x to y from which a camera looks along the court."""
-SAMPLES: Final = 24
-"""Along a line of the court."""
 EDGE: Final = 12.0
 """Grey levels a px: least slope of an edge."""
 ACROSS: Final = (-2.0, -1.0, 0.0, 1.0, 2.0)
@@ -255,12 +253,8 @@ def support(slopes: Array, camera: Pinhole, court: Court) -> float:
 
     Args: slopes: (h, w, 2) as of `slopes_of`.
     """
-    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    points = court.lines[:, None, 0] + share[:, None] * (court.lines[:, None, 1] - court.lines[:, None, 0])
-    pixels = camera.project(points)
-    along = pixels[:, -1] - pixels[:, 0]
-    along /= np.linalg.norm(along, axis=1)[:, None]
-    normal = np.stack((-along[:, 1], along[:, 0]), axis=1)[:, None]
+    _, pixels, normals, _ = sampled(camera, court)
+    normal = normals[:, None]
     fits = np.zeros(pixels.shape[:2], dtype=bool)
     height, width = slopes.shape[:2]
     for offset in ACROSS:

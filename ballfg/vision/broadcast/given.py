@@ -14,9 +14,6 @@ from ballfg.vision.broadcast.motion import Shot
 from ballfg.vision.detection.detections import Detections
 
 CORNERS: Final = 4
-SURE: Final = 1.0
-"""Score of all rows of a table without one."""
-_RULES: Final = {**detections_file.RULES, detections_file.SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
 
 
 def read_corners(path: Path) -> dict[int, Array]:
@@ -59,11 +56,7 @@ def read_candidates(path: Path, shot: Shot, times: Array, kept: Kept) -> Detecti
     Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range, a
         stamp before or after the video.
     """
-    _, _, values = detections_file.read_columns(path, ("t", "u", "v"))
-    count = len(values["t"])
-    detections_file.check_values(path, values, np.arange(count), _RULES)
-    values |= {name: np.full(count, value) for name, value in detections_file.UNSTATED.items() if name not in values}
-    scores = values.get(detections_file.SCORE, np.full(count, SURE))
+    _, _, values = detections_file.read_candidates(path, ("t", "u", "v"))
     stamps, t = kept.stamps, values["t"]
     step = float(np.median(np.diff(stamps)))
     outside = np.flatnonzero((t < stamps[0] - step) | (t > stamps[-1] + step))
@@ -76,7 +69,7 @@ def read_candidates(path: Path, shot: Shot, times: Array, kept: Kept) -> Detecti
     rows = np.flatnonzero((frame >= 0) & (frame < len(shot)))
     rows = rows[np.argsort(frame[rows], kind="stable")]
     pixels = np.column_stack((values["u"], values["v"]))[rows]
-    spread = detections_file.covariances(values)[rows]
+    spread, scores = detections_file.covariances(values)[rows], values[detections_file.SCORE][rows]
     streaks = np.full((len(rows), 2, 2), np.nan)
     mine = times[shot.first : shot.first + len(shot)]
-    return Detections("main", mine, frame[rows], pixels, spread, scores[rows], streaks)
+    return Detections("main", mine, frame[rows], pixels, spread, scores, streaks)

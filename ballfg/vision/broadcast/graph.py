@@ -63,20 +63,6 @@ SURE: Final = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """Cameras of a shot; covariances (n, 7, 7) of turn (rad, in the camera's frame), place (m), log focal length.
-
-    `near`: 1/m, one over the background's distance, of a camera that moves; 0 of one that stands. `readout`: of the
-    time between pictures, from the first row to the last; 0 of a camera that sees all rows at once.
-    """
-
-    cameras: tuple[Pinhole, ...]
-    covariances: Array
-    near: float
-    readout: float
-
-
-@dataclass(frozen=True, eq=False)
 class Problem:
     """First values of a shot's cameras, ridges of each picture, and matches of each with the one before it.
 
@@ -150,14 +136,14 @@ class Fit:
             for k, one in enumerate(self.problem.cameras)
         )
 
-    def solved(self) -> Solved:
-        """The cameras with their covariances."""
-        marginals, covariances = self.marginals, list[Array]()
+    def covariances(self) -> Array:
+        """(n, 7, 7) of the cameras' turn (rad, in the camera's frame), place (m) and log focal length."""
+        covariances = list[Array]()
         for k in range(len(self.problem.cameras)):
             keys = turn_key(k), place_key(k, self.noise.moves), zoom_key(k)
-            joint = marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+            joint = self.marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
             covariances.append(np.block([[joint.at(a, b) for b in keys] for a in keys]))
-        return Solved(self.cameras, np.stack(covariances), self.unknowns.near, self.unknowns.readout)
+        return np.stack(covariances)
 
     def evidence(self) -> float:
         """Logarithm of the probability of the measurements, up to what all fits to them have with one noise of them.
@@ -172,7 +158,7 @@ class Fit:
         return -float(self.graph.error(self.values) + half + priors)
 
 
-def solve(cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Sequence[Match]) -> Solved:
+def solve(cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Sequence[Match]) -> Fit:
     """The most probable cameras of a shot, and the noise with which the measurements are most probable.
 
     Args:
@@ -187,7 +173,7 @@ def solve(cameras: Sequence[Pinhole], seen: Sequence[Ridges | None], matched: Se
         if number < ROUNDS - 1:
             noise, start = _noise(fit), fit.values
     fit = _moving(fit) or fit
-    return (_rolling(fit) or fit).solved()
+    return _rolling(fit) or fit
 
 
 def _moving(stands: Fit) -> Fit | None:

@@ -42,6 +42,8 @@ REACHES: Final = (8.0, 5.0, 3.0, 3.0)
 """px, in which ridges are looked for, turn by turn."""
 CLOSE: Final = 1.5
 """px within which a ridge fits."""
+EVERY: Final = np.arange(7)
+"""Numbers of turn, place and log focal length of a camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,12 +84,7 @@ def brightness(image: Image) -> Array32:
 
 def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridges:
     """The ridges of a picture's `brightness` within `reach` px of the lines of a court as a camera should see them."""
-    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
-    points = court.lines[:, None, 0] + share[:, None] * (court.lines[:, None, 1] - court.lines[:, None, 0])
-    pixels = camera.project(points)
-    along = pixels[:, -1] - pixels[:, 0]
-    length = np.linalg.norm(along, axis=1)
-    normal = np.stack((-along[:, 1], along[:, 0]), axis=1) / length[:, None]
+    points, pixels, normal, length = sampled(camera, court)
     normals = np.broadcast_to(normal[:, None], pixels.shape)
     half = 0.5 * court.across[:, None]
     width = np.abs(((camera.project(points + half) - camera.project(points - half)) * normals).sum(axis=2))
@@ -99,6 +96,16 @@ def ridges(image: Array32, camera: Pinhole, court: Court, reach: float) -> Ridge
     offset, good = _brightest(image, pixels[inside], normals[inside], reach, width[inside], flank)
     asked = inside.sum(axis=1)
     return Ridges(points[inside][good], offset[good], normals[inside][good], line[good], asked)
+
+
+def sampled(camera: Pinhole, court: Court) -> tuple[Array, Array, Array, Array]:
+    """Places (l, k, 3) m along a court's lines, their pixels (l, k, 2); the lines' normals (l, 2), lengths (l,) px."""
+    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    points = court.lines[:, None, 0] + share[:, None] * (court.lines[:, None, 1] - court.lines[:, None, 0])
+    pixels = camera.project(points)
+    along = pixels[:, -1] - pixels[:, 0]
+    length = np.linalg.norm(along, axis=1)
+    return points, pixels, np.stack((-along[:, 1], along[:, 0]), axis=1) / length[:, None], length
 
 
 def _crossed(pixels: Array, ends: Array, near: float) -> Mask:
@@ -173,16 +180,15 @@ def moved(camera: Pinhole, step: Array) -> Pinhole:
     return replace(camera, turn=turn, place=camera.place + step[3:6], focal=float(camera.focal * np.exp(step[6])))
 
 
-def corrected(image: Array32, camera: Pinhole, court: Court, free: slice = slice(0, 7)) -> tuple[Pinhole, float]:
+def corrected(image: Array32, camera: Pinhole, court: Court, free: Index = EVERY) -> tuple[Pinhole, float]:
     """The camera that fits the ridges of a picture's `brightness`, and the share of the court's lines that then fit.
 
     Args: free: numbers of the seven that are corrected; the others stay.
     """
-    unknown = np.r_[free] if isinstance(free, slice) else free
     first = camera.focal
     for reach in REACHES:
         seen = ridges(image, camera, court, reach)
-        if len(seen.offset) < 2 * len(unknown):
+        if len(seen.offset) < 2 * len(free):
             return camera, 0.0
         row = np.einsum("na,nab->nb", seen.normal, slopes(camera, seen.points)[1]) / SIGMA
         weight = 1.0 / (1.0 + (seen.offset / SIGMA / ROBUST) ** 2)
@@ -191,7 +197,7 @@ def corrected(image: Array32, camera: Pinhole, court: Court, free: slice = slice
         information[6, 6] += FOCAL_SIGMA**-2
         pull[6] += np.log(first / camera.focal) / FOCAL_SIGMA**2
         step = np.zeros(7)
-        step[unknown] = np.linalg.solve(information[np.ix_(unknown, unknown)], pull[unknown])
+        step[free] = np.linalg.solve(information[np.ix_(free, free)], pull[free])
         step *= min(1.0, 0.2 / np.abs(step[[0, 1, 2, 6]]).max())
         camera = moved(camera, step)
     if not np.isfinite(camera.project(court.corners)).all():

@@ -17,7 +17,7 @@ from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.background import ALIKE, Match, linked
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.find import cameras_of, find_court
-from ballfg.vision.broadcast.graph import Solved, solve
+from ballfg.vision.broadcast.graph import solve
 from ballfg.vision.broadcast.lines import REACHES, Ridges, brightness, corrected, moved, ridges, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.one_thread import one_thread
@@ -220,8 +220,9 @@ def _followed(
         cameras.append(camera)
         seen.append(lines if fit > FOLLOWED else None)
         fits.append(lines.fit)
-    found: Solved = solve(cameras, seen, links)
-    return Shot(first, found.cameras, found.covariances, np.array(fits), found.near, found.readout)
+    found = solve(cameras, seen, links)
+    near, readout = found.unknowns.near, found.unknowns.readout
+    return Shot(first, found.cameras, found.covariances(), np.array(fits), near, readout)
 
 
 def carried(camera: Pinhole, before: Array, now: Array) -> Pinhole:

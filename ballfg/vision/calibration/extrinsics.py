@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from ballfg.arrays import Array
 from ballfg.checks import listed, shown
-from ballfg.vision.calibration.intrinsics import POSE, slopes_of
+from ballfg.vision.calibration.intrinsics import POSE, rms, slopes_of
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 
@@ -40,7 +40,7 @@ class Extrinsics:
     @property
     def rms(self) -> float:
         """px, root mean square length of the residuals."""
-        return _rms(self.residuals)
+        return rms(self.residuals)
 
     @property
     def chance(self) -> float:
@@ -196,10 +196,6 @@ def _is_above(camera: Camera, points: Array) -> bool:
     return bool((camera.centre - centre) @ normal * normal[2] >= 0.0)
 
 
-def _rms(residuals: Array) -> float:
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
-
-
 def _culprit(found: Extrinsics) -> str:
     """A sentence with the one point whose removal resolves the error, if there is one."""
     marked = found.marked
@@ -208,7 +204,7 @@ def _culprit(found: Extrinsics) -> str:
         points, pixels = (np.delete(array, i, axis=0) for array in (marked.points, marked.pixels))
         rest = Marked(names, points, pixels, marked.sigma)
         cameras = _poses(found.camera, rest, _check_points(found.camera, rest))
-        if min(_rms(camera.project(rest.points) - rest.pixels) for camera in cameras) <= MAX_RMS / 3 * marked.sigma:
+        if min(rms(camera.project(rest.points) - rest.pixels) for camera in cameras) <= MAX_RMS / 3 * marked.sigma:
             return f"Without {shown(marked.names[i])} the others agree. "
     return ""
 

@@ -55,7 +55,7 @@ class FittedView:
     @property
     def rms(self) -> float:
         """px, root mean square length of the residuals."""
-        return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
+        return rms(self.residuals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class Intrinsics:
     @property
     def rms(self) -> float:
         """px, root mean square length of the residuals of `views`."""
-        return float(np.sqrt((np.concatenate([v.residuals for v in self.views]) ** 2).sum(axis=1).mean()))
+        return rms(np.concatenate([v.residuals for v in self.views]))
 
 
 def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) -> Intrinsics:
@@ -119,6 +119,11 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
         _, rvec, tvec = cv2.solvePnP(view.points, view.pixels, fitted.camera.matrix, fitted.camera.distortion)
         outside.append(_fitted(fitted.camera, view, np.ravel(rvec), np.ravel(tvec)))
     return replace(fitted, left_out=tuple(outside), missed=missed)
+
+
+def rms(residuals: Array) -> float:
+    """px, root mean square length of residuals (n, 2) px."""
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 def turn(normals: Array) -> float:

@@ -202,9 +202,6 @@ def _refuse(wrong: Mask, what: str, name: str, rule: str) -> None:
 
 REQUIRED: Final = ("t", detections_file.CAMERA, "u", "v")
 UNUSED: Final = (KEY,)  # columns that may be there and are not needed: which ball a row belongs to is found anew
-SURE: Final = 1.0  # score of all rows of a table without one: somebody has chosen them
-_UNSTATED: Final = detections_file.UNSTATED | {detections_file.SCORE: SURE}
-_RULES: Final = {**detections_file.RULES, detections_file.SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
 
 
 def read_detections(
@@ -223,16 +220,14 @@ def read_detections(
     Raises: FileNotFoundError: there is no such file. ValueError: a column that is missing, a cell out of its range, an
         unknown camera, a camera without rows; the message names file, line and column.
     """
-    header, texts, values = detections_file.read_columns(path, REQUIRED)
+    header, texts, values = detections_file.read_candidates(path, REQUIRED)
     names = texts[detections_file.CAMERA]
     rows = np.arange(len(names))
-    detections_file.check_values(path, values, rows, _RULES)
     detections_file.check_cameras(path, names, rows, [camera.name for camera in cameras], ignored)
     blind = [camera.name for camera in cameras if not (names == camera.name).any()]
     if blind:
         problem = f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}"
         raise ValueError(f"{problem}. Add them, or leave the camera out with --without {blind[0]}.")
-    values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
     known = (*REQUIRED, *detections_file.OPTIONAL, *UNUSED)
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in known]
     number = np.unique(names, return_inverse=True)[1]

@@ -170,7 +170,7 @@ def test_a_rolling_shutter_is_found_from_a_pan_that_changes(seen, readout):
         court.append(replace(seen[0], normal=normal, offset=(normal * off).sum(axis=1) + rng.normal(0, 0.1, len(off))))
         pair = [shown(one, far) + rng.normal(0.0, 0.1, far[:, :2].shape) for one in (max(k - 1, 0), k)]
         links += [Match(*pair, np.eye(3))] if k else []
-    found = graph.solve(cameras, court, links)
+    found = graph.solve(cameras, court, links).unknowns
     assert found.readout == pytest.approx(readout, abs=0.1)
     assert (found.readout == 0.0) == (readout == 0.0)
     assert found.near == 0.0
