@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from ballfg.arrays import Array
 from ballfg.checks import drawn
-from ballfg.pages.outline import Outline
 from ballfg.pages.shot import HALF_WIDTH, ShownShot, unbroken
+from ballfg.pages.shown import Outline
 
 AXES: Final = ("x", "y", "z")
 COLOURS: Final = {"estimate": "#0072b2", "prediction": "#d55e00"}

@@ -7,9 +7,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.pages.html import Html, doubtful, explained, items, own, section, table, tag, whole_page
-from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.shot import FLIGHT, HALF_WIDTH, LEVEL, ShownShot
-from ballfg.pages.shown import Shown
+from ballfg.pages.shown import NET_HEIGHT, Outline, Shown
 from ballfg.pages.sight import near_picture
 from ballfg.state import POSITION, SPIN, VELOCITY
 
@@ -27,7 +26,8 @@ def show_page(shown: Shown) -> str:
     name = _name(shown)
     doubts = doubtful(() if shown.given.dataset is None else shown.given.dataset.info.doubts)
     header = tag("header", tag("p", name), tag("h1", _sentence(shown)), doubts, items(shown.notes))
-    parts = [_flight(shown), _measured_and_predicted(shown), _residuals(shown), _coverage(shown), _diagnosis(shown)]
+    of_shots = [_flight(shown), _measured_and_predicted(shown), _residuals(shown)] if shown.shots else []
+    parts = [*of_shots, _coverage(shown), _diagnosis(shown)]
     return whole_page(
         f"{name}: shots",
         header,
@@ -67,8 +67,6 @@ def _sentence(shown: Shown) -> str:
 
 
 def _flight(shown: Shown) -> Html:
-    if not shown.shots:
-        return Html()
     options = [tag("option", shot.name) for shot in shown.shots]
     scales = [tag("option", f"×{n}", value=str(n)) for n in (1, 3, 10)]
     speeds = [
@@ -106,8 +104,6 @@ def _camera_choices(shown: Shown) -> list[str]:
 
 
 def _measured_and_predicted(shown: Shown) -> Html:
-    if not shown.shots:
-        return Html()
     words = "The bands hold 90 %: of the ball's place for an estimate, of a measurement for a prediction."
     figures = [_figure("axes", "Position by axis", words, "plot tall")]
     if shown.given.predictions is not None and shown.given.dataset is not None:
@@ -117,7 +113,7 @@ def _measured_and_predicted(shown: Shown) -> Html:
 
 
 def _residuals(shown: Shown) -> Html:
-    if not shown.shots or shown.given.states is None or shown.given.dataset is None:
+    if shown.given.states is None or shown.given.dataset is None:
         return Html()
     meaning = "The measured position less the estimated one. A pattern in time is something that the model lacks."
     figures = [_figure("residuals", "In mm", "Along x, y and z.", "plot")]

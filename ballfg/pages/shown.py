@@ -1,23 +1,44 @@
-"""Chooses the shots of a page from the given files and checks these against each other."""
+"""Chooses the shots of a page from the given files, checks these against each other, and places table and floor."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import did_you_mean, shown
+from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.pages.given import Given
-from ballfg.pages.outline import Outline, outline
 from ballfg.pages.shot import SAME_STAMP, Coverage, ShownShot, coverage, marks
 from ballfg.pages.sight import sight
 from ballfg.pages.tables import ResultTable
-from ballfg.tracks import Track
+from ballfg.tracks import TABLE_TENNIS, Track
+from ballfg.tracks.info import TENNIS, DatasetInfo
 
 MOST_SHOTS = 40  # Number of shots on a page without named ones: a list that is still readable
 MOST_ROWS = 36_000
 """Largest number of samples, states and predictions on a page: about 3 MB beside the drawing library's 5 MB."""
 ROBUST = 1.4826  # Standard deviation of a normal distribution over its median absolute deviation
+NET_HEIGHT = 0.1525  # m, height above the table, and overhang at its sides (ITTF Laws 2.2)
+SMALL_BALL = 0.5 * (TABLE_TENNIS.radius + TENNIS.radius)
+"""m. Balls below this radius count as table-tennis balls: their table has the size of the rules, and a net."""
+MARGIN = 0.2  # m by which a surface with unknown ends extends beyond the samples
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Heights and ends of table and floor."""
+
+    height: float  # m, of the surface
+    extent: tuple[float, float, float, float]  # (x_low, x_high, y_low, y_high) m
+    net: bool  # True if a net stands across the longer side
+    floor: float | None  # m, height of the floor; None if unknown
+    words: str  # a sentence on the origin of the ends
+
+    @property
+    def surfaces(self) -> tuple[float, ...]:
+        """m, heights of table and floor."""
+        return (self.height,) if self.floor is None else (self.height, self.floor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,3 +200,34 @@ def _with_noise(given: Given, shots: list[ShownShot]) -> tuple[list[ShownShot], 
     x, y, z = (1e3 * sigma).tolist()
     found = [replace(shot, noise=np.broadcast_to(sigma, shot.positions.shape)) for shot in shots]
     return found, f"{words}: {x:.2g} mm in x, {y:.2g} mm in y, {z:.2g} mm in z."
+
+
+def outline(info: DatasetInfo, positions: Array) -> Outline | None:
+    """The table of a dataset; None if it has no surface.
+
+    Args: info: of the dataset.  positions: (n, 3) m, samples above the table, n >= 1.
+    """
+    if info.table_height is None:
+        return None
+    low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
+    seen = (low[0] - MARGIN, high[0] + MARGIN, low[1] - MARGIN, high[1] + MARGIN)
+    small = info.ball.radius < SMALL_BALL
+    floor = info.table_height - TABLE_ABOVE_FLOOR if small else None
+    ends: Iterable[float]
+    if info.table_extent is not None:
+        words = "The ends of the table are those of dataset.yaml."
+        ends = (end if np.isfinite(end) else other for end, other in zip(info.table_extent, seen, strict=True))
+    elif not small:
+        words = "dataset.yaml does not state where the surface ends: it is drawn under all samples."
+        ends = seen
+    else:
+        words = (
+            "dataset.yaml does not state where the table's ends are: a table of the rules' size is drawn under the "
+            "middle of the samples. Only its height is known."
+        )
+        x, y = 0.5 * (low + high)
+        along_x = high[0] - low[0] >= high[1] - low[1]
+        half_x, half_y = 0.5 * np.array((TABLE_LENGTH, TABLE_WIDTH) if along_x else (TABLE_WIDTH, TABLE_LENGTH))
+        ends = (x - half_x, x + half_x, y - half_y, y + half_y)
+    x0, x1, y0, y1 = map(float, ends)
+    return Outline(info.table_height, (x0, x1, y0, y1), small and info.table_extent is not None, floor, words)

@@ -89,15 +89,9 @@ def on_cluster(kind: str | None, address: str | None = None) -> Iterator[int | N
         return
     if kind not in CLUSTERS:
         raise ValueError(f"cluster must be {' or '.join(CLUSTERS)}; got {shown(kind)}. Choose one of them.")
-    opened: Any
-    if kind == "dask":
-        from ballfg.parallel.dask_cluster import DaskCluster
+    from ballfg.parallel.clusters import DaskCluster, RayCluster
 
-        opened = DaskCluster(address)
-    else:
-        from ballfg.parallel.ray_cluster import RayCluster
-
-        opened = RayCluster(address)
+    opened = DaskCluster(address) if kind == "dask" else RayCluster(address)
     token = _CLUSTER.set(opened)
     try:
         yield opened.slots

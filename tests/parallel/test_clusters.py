@@ -18,7 +18,7 @@ from ballfg.estimation.registry import make_estimator
 from ballfg.parallel import on_cluster
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.tracks import Dataset, read_dataset
-from tests.commands import status
+from tests.commands import printed, refused, status
 from tests.parallel.conftest import TRACKS
 
 needs_dask = pytest.mark.skipif(not find_spec("distributed"), reason="dask is not installed (pip install ballfg[dask])")
@@ -56,15 +56,11 @@ def content(one: Estimate) -> bytes:
 
 
 @needs_dask
-def test_a_dask_cluster_finds_the_same_to_the_last_bit(
-    cluster: Any, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dask_cluster_finds_the_same_to_the_last_bit(cluster: Any, folder: Path, tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("one.parquet", "dask.parquet")]
     assert status("estimate", folder, "--out", files[0], "--jobs", 1) == 0
     where = "--cluster", "dask", "--address", cluster.scheduler_address
-    capsys.readouterr()
-    assert status("estimate", folder, "--out", files[1], *where) == 0
-    said = capsys.readouterr()
+    said = printed("estimate", folder, "--out", files[1], *where)
     assert f"  {TRACKS} tracks: converged\n" in said.out
     assert "dask cluster: 2 workers\n" in said.err
     assert files[0].read_bytes() == files[1].read_bytes()
@@ -116,26 +112,21 @@ def _bad() -> int:
 
 
 @needs_dask
-def test_a_cluster_that_is_not_there_is_one_line(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ballfg.parallel.dask_cluster.CONNECT", 0.5)
+def test_a_cluster_that_is_not_there_is_one_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ballfg.parallel.clusters.CONNECT", 0.5)
     out = tmp_path / "states.csv"
-    assert status("estimate", folder, "--out", out, "--cluster", "dask", "--address", "tcp://127.0.0.1:9") == 2
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1
-    assert "nothing usable answers at tcp://127.0.0.1:9" in said[0]
-    assert status("estimate", folder, "--out", out, "--cluster", "dask", "--address", "somewhere") == 2
-    assert "such as tcp://10.0.0.1:8786; got somewhere" in capsys.readouterr().err
+    assert "nothing usable answers at tcp://127.0.0.1:9" in refused(
+        "estimate", folder, "--out", out, "--cluster", "dask", "--address", "tcp://127.0.0.1:9"
+    )
+    assert "such as tcp://10.0.0.1:8786; got somewhere" in refused(
+        "estimate", folder, "--out", out, "--cluster", "dask", "--address", "somewhere"
+    )
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("words", [("--cluster", "dusk"), ("--address", "tcp://10.0.0.1:8786")])
-def test_options_that_make_no_sense(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, str]
-) -> None:
-    assert status("estimate", folder, "--out", tmp_path / "states.csv", *words) == 2
-    assert words[1] in capsys.readouterr().err
+def test_options_that_make_no_sense(folder: Path, tmp_path: Path, words: tuple[str, str]) -> None:
+    assert words[1] in refused("estimate", folder, "--out", tmp_path / "states.csv", *words)
 
 
 @pytest.mark.parametrize("kind", ["dask", "ray"])

@@ -1,4 +1,4 @@
-"""Computes chunks on a dask cluster as futures, which dask computes again after the loss of a worker.
+"""Computes chunks on a cluster: on dask as futures, on ray as tasks, both of which outlive the loss of a worker.
 
 joblib's own dask backend is not used: it takes from the stream as fast as workers compute, even if results are consumed
 slowly, so that they pile up in memory.
@@ -17,20 +17,28 @@ from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.parallel.work import Work, compute, packed, too_many_deaths
 
-CONNECT: Final = 10.0  # s, timeout for the scheduler, and for its first worker
-NOBODY: Final = 60.0  # s without any worker after which the work ends
-LOOK: Final = 5.0  # s between two checks of the cluster while a chunk is computed
+CONNECT: Final = 10.0  # s, timeout for dask's scheduler, and for its first worker
+NOBODY: Final = 60.0  # s without any worker of dask after which the work ends
+LOOK: Final = 5.0  # s between two checks of the cluster while dask computes a chunk
+MOST_DEATHS: Final = 3  # largest number of workers of ray that a chunk may lose
 
 
-class DaskCluster:
+class _Cluster:
+    """What the executors of clusters share."""
+
+    batch, helped = 16, False
+
+    def stop(self) -> None:
+        """Does nothing: chunks are cancelled one by one, and the cluster continues without them."""
+
+
+class DaskCluster(_Cluster):
     """All workers of a scheduler.
 
     Args: address: of the scheduler, such as tcp://10.0.0.1:8786.
     Raises: ValueError: no address, `distributed` is not installed, or workers with other versions. ConnectionError: no
         scheduler or no worker is there.
     """
-
-    batch, helped = 16, False
 
     def __init__(self, address: str | None) -> None:
         try:
@@ -64,7 +72,7 @@ class DaskCluster:
             self.look()
         return max(1, self._workers)
 
-    def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_Chunk"]:
+    def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_DaskChunk"]:
         """Submits a function of a chunk; see Executor.
 
         The function is the result of a task of its own, not scattered data: if its worker dies, dask computes it again.
@@ -72,9 +80,9 @@ class DaskCluster:
         work = Work.of(function)
         content = self._client.submit(bytes, work.content, key=f"ballfg-{work.name}-{uuid.uuid4().hex[:8]}")
 
-        def send(chunk: Sequence[Any]) -> _Chunk:
+        def send(chunk: Sequence[Any]) -> _DaskChunk:
             call = (compute, work.name, content, packed(chunk), own_versions())
-            return _Chunk(self, self._client.submit(*call, key=f"ballfg-{uuid.uuid4().hex}"), chunk)
+            return _DaskChunk(self, self._client.submit(*call, key=f"ballfg-{uuid.uuid4().hex}"), chunk)
 
         return send
 
@@ -91,9 +99,6 @@ class DaskCluster:
         if now - self._nobody_since > NOBODY:
             rule = f"the dask scheduler at {self._address} must have workers"
             raise ConnectionError(f"{rule}; the last left {NOBODY:g} s ago.")
-
-    def stop(self) -> None:
-        """Does nothing: chunks are cancelled one by one, and the cluster continues without them."""
 
     def close(self) -> None:
         """Leaves the cluster unchanged."""
@@ -112,7 +117,7 @@ class DaskCluster:
                 raise ValueError(different)
 
 
-class _Chunk:
+class _DaskChunk:
     def __init__(self, cluster: DaskCluster, future: Any, chunk: Sequence[Any]) -> None:
         self._cluster, self._future, self._first = cluster, future, repr(chunk[0])
 
@@ -142,3 +147,85 @@ class _Chunk:
     def cancel(self) -> None:
         """Cancels the chunk."""
         self._future.cancel()
+
+
+class RayCluster(_Cluster):
+    """All processors of a ray cluster.
+
+    Args: address: of the cluster; None for this machine's, or for the one that this process has joined.
+    Raises: ValueError: ray is not installed, or nodes with other versions. ConnectionError: no cluster is there.
+    """
+
+    def __init__(self, address: str | None) -> None:
+        try:
+            import ray
+        except ImportError:
+            raise ValueError('cluster ray needs ray, which is not installed. Run: pip install "ballfg[ray]"') from None
+        self._ray, self._joined = ray, not ray.is_initialized()
+        if self._joined:
+            try:
+                ray.init(address=address or "auto", logging_level="CRITICAL", log_to_driver=False)
+            except (OSError, ValueError, RuntimeError, AssertionError) as error:
+                raise ConnectionError(
+                    f"address must be that of a ray cluster; nothing usable answers at {address or 'this machine'} "
+                    f"({one_line(error)}). Start it: ray start --head."
+                ) from None
+        self._task = ray.remote(max_retries=MOST_DEATHS, num_cpus=1)(compute)
+        try:
+            self._check_nodes()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def slots(self) -> int:
+        """Number of processors; each computes one chunk at a time."""
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_RayChunk"]:
+        """Submits a function of a chunk; see Executor."""
+        work = Work.of(function)
+        content = self._ray.put(work.content)
+
+        submit = self._task.remote
+        return lambda chunk: _RayChunk(self._ray, submit(work.name, content, packed(chunk), own_versions()), chunk)
+
+    def close(self) -> None:
+        """Leaves the cluster unchanged."""
+        if self._joined:
+            self._ray.shutdown()
+
+    def _check_nodes(self) -> None:
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        def asked(expression: str) -> Any:  # sent as a whole: a node without ballfg could not import it
+            return eval(expression)
+
+        for node in self._ray.nodes():
+            if node["Alive"] and node["Resources"].get("CPU"):
+                there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+                theirs = self._ray.get(self._ray.remote(asked).options(scheduling_strategy=there).remote(HERE))
+                if different := differences(theirs, f"the node {node['NodeManagerAddress']}"):
+                    raise ValueError(different)
+
+
+class _RayChunk:
+    def __init__(self, ray: Any, sent: Any, chunk: Sequence[Any]) -> None:
+        self._ray, self._sent, self._first = ray, sent, repr(chunk[0])
+
+    def done(self) -> bool:
+        """True if the result, or an error, is there."""
+        return bool(self._ray.wait([self._sent], timeout=0)[0])
+
+    def result(self) -> Any:
+        """The result; see Pending. Raises: ChildProcessError: if the chunk lost too many workers."""
+        try:
+            return pickle.loads(self._ray.get(self._sent))
+        except self._ray.exceptions.RayTaskError as error:
+            raise error.cause from None
+        except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.OutOfMemoryError):
+            raise too_many_deaths("ray", self._first) from None
+
+    def cancel(self) -> None:
+        """Cancels the chunk."""
+        self._ray.cancel(self._sent)
