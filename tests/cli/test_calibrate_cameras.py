@@ -11,31 +11,20 @@ import numpy as np
 import pytest
 import yaml
 
-from ballfg.cli.main import run
 from ballfg.vision import Camera
 from ballfg.vision.calibration.table_points import table_points
 from ballfg.vision.camera_file import read_cameras, write_cameras
+from tests.commands import printed, refused, status
 from tests.vision.calibration.board_scenes import CHARUCO, TRUE, image_of, poses
+from tests.vision.filming import looking
 
 BOARD = ("--board", "charuco", "--squares", "8x6", "--square", 0.04, "--marker", 0.03)
 CENTRES = {"left": (-1.2, 2.6, 2.2), "right": (-1.0, -2.8, 2.3)}
 
 
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run(["calibrate-cameras", *map(str, arguments)])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
-
-
 def standing(name: str) -> Camera:
-    centre = np.array(CENTRES[name])
-    forward = np.array([1.37, 0.0, 0.76]) - centre
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    rotation = np.stack((right, np.cross(forward, right), forward))
-    return replace(TRUE, name=name, rvec=cv2.Rodrigues(rotation)[0], tvec=-rotation @ centre)
+    lens = {"size": TRUE.size, "matrix": TRUE.matrix, "distortion": TRUE.distortion}
+    return looking(name, CENTRES[name], (1.37, 0.0, 0.76), **lens)
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +49,10 @@ def images(calib: Path, *names: str) -> list[str]:
     return [word for name in names or CENTRES for word in ("--images", f"{name}={calib / name}")]
 
 
-def test_from_images_to_cameras(calib: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_images_to_cameras(calib: Path, tmp_path: Path) -> None:
     out = tmp_path / "cameras.yaml"
     view = ("--view", f"left={calib / 'left' / '00.png'}")
-    assert status(*BOARD, *images(calib), "--table", calib / "table.yaml", *view, "--out", out) == 0
-    said = capsys.readouterr()
+    said = printed("calibrate-cameras", *BOARD, *images(calib), "--table", calib / "table.yaml", *view, "--out", out)
     assert said.err == ""
     assert "left: 640x480\n  lens: 11 of 13 images, RMS 0.0" in said.out
     assert "left out, they disagree with the others: " in said.out
@@ -92,12 +80,12 @@ def test_from_images_to_cameras(calib: Path, tmp_path: Path, capsys: pytest.Capt
     assert (width, height) == (1800, 852)
 
 
-def test_lenses_first_and_places_later(calib: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lenses_first_and_places_later(calib: Path, tmp_path: Path) -> None:
     lenses, out = tmp_path / "lenses.json", tmp_path / "cameras.xml"
-    assert status(*BOARD, *images(calib), "--out", lenses) == 0
-    assert f"{lenses}: 2 cameras, lenses only" in capsys.readouterr().out
-    assert status("--intrinsics", lenses, "--table", calib / "table.yaml", "--out", out) == 0
-    said = capsys.readouterr().out
+    assert (
+        f"{lenses}: 2 cameras, lenses only" in printed("calibrate-cameras", *BOARD, *images(calib), "--out", lenses).out
+    )
+    said = printed("calibrate-cameras", "--intrinsics", lenses, "--table", calib / "table.yaml", "--out", out).out
     assert "lens:" not in said
     assert "place: " in said
     known, placed = read_cameras(lenses, posed=False), read_cameras(out)
@@ -105,8 +93,20 @@ def test_lenses_first_and_places_later(calib: Path, tmp_path: Path, capsys: pyte
         np.testing.assert_array_equal(lens.matrix, camera.matrix)
         assert np.linalg.norm(camera.centre - CENTRES[camera.name]) < 0.02
     rough = tmp_path / "rough.yaml"
-    assert status("--intrinsics", lenses, "--table", calib / "table.yaml", "--focal-sigma", 0.05, "--out", rough) == 0
-    assert "focal length " in capsys.readouterr().out
+    assert (
+        "focal length "
+        in printed(
+            "calibrate-cameras",
+            "--intrinsics",
+            lenses,
+            "--table",
+            calib / "table.yaml",
+            "--focal-sigma",
+            0.05,
+            "--out",
+            rough,
+        ).out
+    )
     for lens, camera in zip(known, read_cameras(rough), strict=True):
         assert abs(np.log(camera.matrix[0, 0] / lens.matrix[0, 0])) < 3.0 * np.sqrt(camera.covariance[6, 6])
 
@@ -119,7 +119,7 @@ def test_a_focal_length_that_was_found_roughly_stays_rough_after_a_move(tmp_path
     write_cameras(tmp_path / "first.yaml", [first])
     (tmp_path / "table.yaml").write_text(yaml.safe_dump({"cameras": {"left": shown}}))
     words = ("--table", tmp_path / "table.yaml", "--out", tmp_path / "second.yaml")
-    assert status("--intrinsics", tmp_path / "first.yaml", *words) == 0
+    assert status("calibrate-cameras", "--intrinsics", tmp_path / "first.yaml", *words) == 0
     (second,) = read_cameras(tmp_path / "second.yaml")
     sigmas = np.sqrt(np.diag(second.covariance))
     assert 0.0005 < sigmas[6] <= 0.01
@@ -131,14 +131,12 @@ def test_a_focal_length_that_was_found_roughly_stays_rough_after_a_move(tmp_path
 def test_the_same_bytes_twice(calib: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        assert status(*BOARD, *images(calib, "left"), "--out", tmp_path / name / "c.yaml") == 0
+        assert status("calibrate-cameras", *BOARD, *images(calib, "left"), "--out", tmp_path / name / "c.yaml") == 0
     for file in (tmp_path / "a").iterdir():
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
 
 
-def test_bad_input_is_one_line_and_nothing_is_written(
-    calib: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_line_and_nothing_is_written(calib: Path, tmp_path: Path) -> None:
     out = ("--out", tmp_path / "c.yaml")
     table = ("--table", calib / "table.yaml")
     few = ("--images", f"left={calib / 'left' / '0[0-1].png'}")
@@ -166,15 +164,5 @@ def test_bad_input_is_one_line_and_nothing_is_written(
         ),
     ]
     for arguments, message in cases:
-        assert status(*arguments) == 2, message
-        said = capsys.readouterr()
-        assert said.err.startswith("ballfg: error: ")
-        assert said.err.count("\n") == 1
-        assert message in said.err
-        assert said.out == ""
+        assert message in refused("calibrate-cameras", *arguments)
         assert not list(tmp_path.iterdir())
-
-
-def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("--help") == 0
-    assert "Example: ballfg calibrate-cameras" in capsys.readouterr().out

@@ -16,26 +16,16 @@ from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.scene.recording import record
 from ballfg.simulation.scene.writing import write_scene
 from ballfg.tracks import read_dataset
-from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras, write_cameras
-from tests.commands import status
+from tests.commands import printed, refused, status
+from tests.vision.filming import level
 
 RATE = 100.0
 SIZE = (320, 180)
 SPAN = 0.5  # s
 
 
-def camera(name: str, turn: float) -> Camera:
-    """2.5 m from the point above the middle of the table's near end, looking at it level, from a direction about z."""
-    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    about_z = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-    rotation = upright @ about_z
-    tvec = np.array([0.0, 0.0, 2.5]) - rotation @ (0.0, 0.0, 1.0)
-    matrix = [[250.0, 0.0, 159.5], [0.0, 250.0, 89.5], [0.0, 0.0, 1.0]]
-    return Camera(name, SIZE, matrix, np.zeros(5), cv2.Rodrigues(rotation)[0].ravel(), tvec)
-
-
-RIG = [camera("left", -0.7), camera("middle", 0.1), camera("right", 0.8)]
+RIG = [level(name, turn, 2.5, 1.0, 0.5) for name, turn in (("left", -0.7), ("middle", 0.1), ("right", 0.8))]
 
 
 def centre(times: np.ndarray) -> np.ndarray:
@@ -68,10 +58,9 @@ def table(path: Path, ball: bool = True, late: Mapping[str, float] | None = None
 # --- detections ----------------------------------------------------------------------------------------------------
 
 
-def test_detections_become_a_dataset(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_detections_become_a_dataset(rig: Path, tmp_path: Path) -> None:
     out = tmp_path / "shots"
-    assert status("track", table(tmp_path / "detections.csv"), "--cameras", rig, "--out", out) == 0
-    said = capsys.readouterr()
+    said = printed("track", table(tmp_path / "detections.csv"), "--cameras", rig, "--out", out)
     assert said.err == ""
     assert said.out.startswith(f"{out}: 1 tracks of 50 points; wrote dataset.yaml, tracks.csv, detections.csv")
     assert "  left: 50 frames, 50 candidates, 50 of them a ball" in said.out
@@ -82,17 +71,16 @@ def test_detections_become_a_dataset(rig: Path, tmp_path: Path, capsys: pytest.C
     assert cv2.imread(str(out / "contact_sheet.png")) is not None
 
 
-def test_of_cameras_known_roughly_a_better_way_is_told(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_cameras_known_roughly_a_better_way_is_told(rig: Path, tmp_path: Path) -> None:
     loose = [replace(one, covariance=np.diag(np.square([1e-3] * 3 + [3e-3] * 3 + [3e-3]))) for one in RIG[:2]]
     write_cameras(rig, [*loose, RIG[2]])
     words = ("--cameras", rig, "--no-overlay")
-    assert status("track", table(tmp_path / "detections.csv"), *words, "--out", tmp_path / "rough") == 0
-    assert "note: errors of cameras known roughly (left, middle) last in tracks.csv" in capsys.readouterr().err
+    assert (
+        "note: errors of cameras known roughly (left, middle) last in tracks.csv"
+        in printed("track", table(tmp_path / "detections.csv"), *words, "--out", tmp_path / "rough").err
+    )
     write_cameras(rig, RIG)
-    assert status("track", tmp_path / "detections.csv", *words, "--out", tmp_path / "exact") == 0
-    assert capsys.readouterr().err == ""
+    assert printed("track", tmp_path / "detections.csv", *words, "--out", tmp_path / "exact").err == ""
     (rough,), (exact,) = ([one.sigmas for one in read_dataset(tmp_path / name)] for name in ("rough", "exact"))
     assert (np.median(rough, axis=0) > 1.5 * np.median(exact, axis=0)).any()
 
@@ -107,12 +95,9 @@ def test_what_describes_the_dataset_can_be_given(rig: Path, tmp_path: Path) -> N
     assert "middle" not in (out / "cameras.yaml").read_text()
 
 
-def test_late_stamps_are_found_and_written_with_the_cameras(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_late_stamps_are_found_and_written_with_the_cameras(rig: Path, tmp_path: Path) -> None:
     out, given = tmp_path / "shots", table(tmp_path / "detections.csv", late={"middle": 0.004})
-    assert status("track", given, "--cameras", rig, "--out", out, "--time-offsets") == 0
-    assert "  middle: stamps late by " in capsys.readouterr().out
+    assert "  middle: stamps late by " in printed("track", given, "--cameras", rig, "--out", out, "--time-offsets").out
     by_name = {camera.name: camera for camera in read_cameras(out / "cameras.yaml")}
     assert by_name["left"].time_offset == 0.0
     assert by_name["middle"].time_offset == pytest.approx(0.004, abs=5e-4)
@@ -121,74 +106,59 @@ def test_late_stamps_are_found_and_written_with_the_cameras(
     assert np.sqrt(((track.positions - centre(track.times)) ** 2).sum(axis=1).mean()) < 0.004
 
 
-def test_time_offsets_do_not_stand_in_for_a_turned_camera(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_time_offsets_do_not_stand_in_for_a_turned_camera(rig: Path, tmp_path: Path) -> None:
     turn, _ = cv2.Rodrigues(np.radians([0.0, 0.0, 2.0]))
     rotation = turn @ RIG[1].rotation
     moved = replace(RIG[1], rvec=cv2.Rodrigues(rotation)[0].ravel(), tvec=-rotation @ RIG[1].centre)
     write_cameras(rig, [RIG[0], moved, RIG[2]])
     out = tmp_path / "shots"
     given = table(tmp_path / "detections.csv")
-    assert status("track", given, "--cameras", rig, "--out", out, "--time-offsets") == 0
-    said = capsys.readouterr()
+    said = printed("track", given, "--cameras", rig, "--out", out, "--time-offsets")
     assert "left as they were" in said.err
     assert "stamps late by" not in said.out
     assert all(camera.time_offset == 0.0 for camera in read_cameras(out / "cameras.yaml"))
 
 
-def test_rows_that_stand_twice_count_once(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rows_that_stand_twice_count_once(rig: Path, tmp_path: Path) -> None:
     given = table(tmp_path / "detections.csv")
     lines = given.read_text().splitlines()
     given.write_text("\n".join([lines[0], *(line for line in lines[1:] for _ in range(2))]) + "\n")
-    assert status("track", given, "--cameras", rig, "--out", tmp_path / "shots") == 0
-    said = capsys.readouterr()
+    said = printed("track", given, "--cameras", rig, "--out", tmp_path / "shots")
     assert "1 tracks of 50 points" in said.out
     assert "150 exact repeats of rows dropped" in said.err
 
 
-def test_stamps_in_milliseconds_are_refused(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stamps_in_milliseconds_are_refused(rig: Path, tmp_path: Path) -> None:
     given = table(tmp_path / "detections.csv")
     rows = [line.split(",", 1) for line in given.read_text().splitlines()]
     given.write_text("\n".join([",".join(rows[0]), *(f"{1000 * float(t)},{rest}" for t, rest in rows[1:])]) + "\n")
-    assert status("track", given, "--cameras", rig, "--out", tmp_path / "shots") == 2
-    assert "camera 'left': t must be in s, with a median step of 1e-06 to 1 s; got 10 s" in capsys.readouterr().err
+    assert "camera 'left': t must be in s, with a median step of 1e-06 to 1 s; got 10 s" in refused(
+        "track", given, "--cameras", rig, "--out", tmp_path / "shots"
+    )
 
 
-def test_no_ball_says_how_good_the_best_were_and_leaves_an_empty_dataset(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_ball_says_how_good_the_best_were_and_leaves_an_empty_dataset(rig: Path, tmp_path: Path) -> None:
     out = tmp_path / "shots"
     given = table(tmp_path / "detections.csv", ball=False)
-    assert status("track", given, "--cameras", rig, "--out", out) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
+    said = refused("track", given, "--cameras", rig, "--out", out)
     assert (
         "no ball was found. Best candidates' scores (1 is a ball): left: 0.40, 0.40, 0.40 in 50 frames; middle" in said
     )
     assert "holds an empty dataset; look at contact_sheet.png there" in said
-    assert status("estimate", out, "--out", tmp_path / "states.csv") == 2
-    assert "must hold tracks; got a header without rows" in capsys.readouterr().err
+    assert "must hold tracks; got a header without rows" in refused("estimate", out, "--out", tmp_path / "states.csv")
 
 
-def test_a_camera_that_was_turned_is_named(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_that_was_turned_is_named(rig: Path, tmp_path: Path) -> None:
     nudge = cv2.Rodrigues(np.deg2rad([0.5, 0.0, 0.0]))[0]
     turned = cv2.Rodrigues(nudge @ RIG[1].rotation)[0].ravel()
     write_cameras(rig, [RIG[0], replace(RIG[1], rvec=turned, tvec=nudge @ RIG[1].tvec), RIG[2]])
     given = table(tmp_path / "detections.csv")
-    assert status("track", given, "--cameras", rig, "--out", tmp_path / "shots") == 0
-    assert capsys.readouterr().err.startswith("note: Camera middle has moved since its calibration")
+    assert printed("track", given, "--cameras", rig, "--out", tmp_path / "shots").err.startswith(
+        "note: Camera middle has moved since its calibration"
+    )
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    assert status("track", *arguments) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("ballfg: error: ")
-    assert said.count("\n") == 1
-    return said
-
-
-def test_bad_detections_are_refused(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_detections_are_refused(rig: Path, tmp_path: Path) -> None:
     given = table(tmp_path / "detections.csv")
     words = (given, "--cameras", rig, "--out", tmp_path / "shots")
     for options, message in (
@@ -199,21 +169,20 @@ def test_bad_detections_are_refused(rig: Path, tmp_path: Path, capsys: pytest.Ca
         (("--without", "left", "--without", "right", "--time-offsets"), "--time-offsets needs two cameras"),
         (("--ball", "squash"), "ball must be "),
     ):
-        assert message in refused(capsys, *words, *options)
+        assert message in refused("track", *words, *options)
     write_cameras(rig, RIG[:2])
-    assert "line 102, column 'camera': must be a camera: left, middle; got 'right'" in refused(capsys, *words)
+    assert "line 102, column 'camera': must be a camera: left, middle; got 'right'" in refused("track", *words)
     assert not (tmp_path / "shots").exists()
 
 
-def test_what_is_there_is_not_lost(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_there_is_not_lost(rig: Path, tmp_path: Path) -> None:
     given = table(tmp_path / "detections.csv")
     out = tmp_path / "shots"
     words = (given, "--cameras", rig, "--out", out)
-    assert "lies in" in refused(capsys, given, "--cameras", rig, "--out", tmp_path)
+    assert "lies in" in refused("track", given, "--cameras", rig, "--out", tmp_path)
     assert status("track", *words) == 0
     before = (out / "tracks.csv").read_bytes()
-    capsys.readouterr()
-    assert "Replace it with --force" in refused(capsys, *words)
+    assert "Replace it with --force" in refused("track", *words)
     assert status("track", *words, "--force") == 0
     assert (out / "tracks.csv").read_bytes() == before
 
@@ -287,13 +256,12 @@ def test_videos_become_the_tracks_that_were_flown(scene: Path, tracked: Path) ->
 
 @pytest.mark.thorough
 def test_states_and_predictions_of_what_was_filmed_agree_with_the_truth(
-    scene: Path, tracked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: Path, tracked: Path, tmp_path: Path
 ) -> None:
     """The whole way: video, dataset, states straight from pixels, prediction from the first 0.3 s."""
     states, ahead = tmp_path / "states.csv", tmp_path / "ahead.csv"
     assert status("estimate", tracked, "--from", "detections", "--out", states, "--jobs", 1) == 0
     assert status("predict", tracked, "--observe", 0.3, "--out", ahead, "--jobs", 1) == 0
-    capsys.readouterr()
     truth = numbers(scene / "truth.csv", "t", "x", "y", "z", "vx", "vy", "vz")
     found = numbers(states, "t", "x", "y", "z", "vx", "vy", "vz", "sigma_vx", "sigma_vy", "sigma_vz")
     predicted = numbers(ahead, "t", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
@@ -310,11 +278,10 @@ def test_states_and_predictions_of_what_was_filmed_agree_with_the_truth(
         assert np.median(np.abs(off / coming[:, 4:])) < 1.5
 
 
-def test_one_camera_gives_states(one_view: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_camera_gives_states(one_view: Path, tmp_path: Path) -> None:
     scene, out, states = one_view, tmp_path / "shots", tmp_path / "states.csv"
     words = [scene / "right.mp4", "--stamps", f"right={scene}/right_stamps.csv", "--cameras", scene / "cameras.yaml"]
-    assert status("track", *words, "--out", out, "--jobs", 1) == 0
-    said = capsys.readouterr().out
+    said = printed("track", *words, "--out", out, "--jobs", 1).out
     wrote = "dataset.yaml, states.csv, events.csv, detections.csv, cameras.yaml, overlay.mp4, contact_sheet.png"
     assert f"wrote {wrote}" in said
     truth, found = (numbers(path, "t", "x", "y", "z") for path in (scene / "truth.csv", out / "states.csv"))
@@ -377,64 +344,58 @@ def stamps(path: Path, times: np.ndarray) -> Path:
     return path
 
 
-def test_bad_videos_are_refused(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_videos_are_refused(rig: Path, tmp_path: Path) -> None:
     left, middle, right = (film(tmp_path / f"{model.name}.mp4") for model in RIG)
     out = tmp_path / "shots"
     words = ("--cameras", rig, "--out", out, "--jobs", 1)
-    alone = refused(capsys, left, "--out", out, "--time-offsets")
+    alone = refused("track", left, "--out", out, "--time-offsets")
     assert "--time-offsets must not be given without --cameras. Leave it out." in alone
     for text in ("2.74x1.525", "x=0..2.74", "x=0..2.7.4,y=-1..1"):
-        said = refused(capsys, left, middle, right, *words, "--table", text)
+        said = refused("track", left, middle, right, *words, "--table", text)
         assert f"table must read x=LOW..HIGH,y=LOW..HIGH, m; got '{text}'. Write for instance" in said
-    assert "frame.table.y must increase" in refused(capsys, left, middle, right, *words, "--table", "x=0..1,y=1..-1")
+    assert "frame.table.y must increase" in refused("track", left, middle, right, *words, "--table", "x=0..1,y=1..-1")
     assert "got none for 'middle'. Give it as middle=FILE, or leave the camera out with --without middle" in refused(
-        capsys, left, right, *words
+        "track", left, right, *words
     )
     assert "video 'side.mp4' must be of a camera: left, middle, right; got 'side'" in refused(
-        capsys, left, "side.mp4", *words
+        "track", left, "side.mp4", *words
     )
-    assert "does not exist" in refused(capsys, left, middle, f"right={tmp_path}/no.mp4", *words)
+    assert "does not exist" in refused("track", left, middle, f"right={tmp_path}/no.mp4", *words)
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(right.read_bytes()[:2000])
-    assert "broken.mp4 must be a file that FFmpeg decodes" in refused(capsys, left, middle, f"right={broken}", *words)
+    assert "broken.mp4 must be a file that FFmpeg decodes" in refused("track", left, middle, f"right={broken}", *words)
     small = film(tmp_path / "small.mp4", (160, 90))
-    other = refused(capsys, left, middle, f"right={small}", *words)
+    other = refused("track", left, middle, f"right={small}", *words)
     assert "got 320x180 in the cameras' file and a video of 160x90" in other
     back = stamps(tmp_path / "back.csv", np.r_[np.arange(10), 8, np.arange(11, 20)] / 50.0)
-    behind = refused(capsys, left, middle, right, *words, "--stamps", f"left={back}")
+    behind = refused("track", left, middle, right, *words, "--stamps", f"left={back}")
     assert "frame 10 has 0.16 s after 0.18 s" in behind
     later = stamps(tmp_path / "later.csv", 60.0 + np.arange(20) / 50.0)
     assert "camera 'right' overlaps with no other: 'left' 0 to 0.38 s; 'middle' 0 to 0.38 s; 'right' 60 to" in refused(
-        capsys, left, middle, right, *words, "--stamps", f"right={later}"
+        "track", left, middle, right, *words, "--stamps", f"right={later}"
     )
     assert not out.exists()
 
 
-def test_videos_without_a_ball_leave_pictures_to_look_at(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_videos_without_a_ball_leave_pictures_to_look_at(rig: Path, tmp_path: Path) -> None:
     out = tmp_path / "shots"
     given = [film(tmp_path / f"{model.name}.mp4") for model in RIG]
-    said = refused(capsys, *given, "--cameras", rig, "--out", out, "--jobs", 1)
+    said = refused("track", *given, "--cameras", rig, "--out", out, "--jobs", 1)
     assert "no ball was found. Best candidates' scores (1 is a ball): left: no candidate in 20 frames" in said
     assert "look at overlay.mp4, contact_sheet.png there" in said
     assert (out / "tracks.csv").read_text().count("\n") == 1
     assert {path.name for path in out.iterdir()} >= {"dataset.yaml", "detections.csv", "overlay.mp4"}
 
 
-def test_a_detector_that_fails_is_told_with_line_and_frame(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_detector_that_fails_is_told_with_line_and_frame(rig: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("def find(image):\n    return 1 / 0\n")
     given = [film(tmp_path / f"{model.name}.mp4") for model in RIG]
     words = (*given, "--cameras", rig, "--out", tmp_path / "shots", "--detector", f"{tmp_path}/mine.py:find")
-    said = refused(capsys, *words, "--jobs", 1)
+    said = refused("track", *words, "--jobs", 1)
     assert "mine.py must run as Python (frame 0 of left); line 2: ZeroDivisionError: division by zero" in said
 
 
-def test_a_detector_of_ones_own_finds_what_it_looks_for(
-    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_detector_of_ones_own_finds_what_it_looks_for(rig: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         "from ballfg.vision.detection.detections import Candidates\n"
         "def corner(image):\n"
@@ -442,6 +403,6 @@ def test_a_detector_of_ones_own_finds_what_it_looks_for(
     )
     given = [film(tmp_path / f"{model.name}.mp4") for model in RIG]
     words = (*given, "--cameras", rig, "--out", tmp_path / "shots", "--detector", f"{tmp_path}/mine.py:corner")
-    assert "left: 0.25, 0.25, 0.25 in 20 frames" in refused(capsys, *words, "--no-overlay", "--jobs", 1)
+    assert "left: 0.25, 0.25, 0.25 in 20 frames" in refused("track", *words, "--no-overlay", "--jobs", 1)
     assert not (tmp_path / "shots" / "overlay.mp4").exists()
-    assert "--colour must not be given with --detector" in refused(capsys, *words, "--colour", "orange", "--force")
+    assert "--colour must not be given with --detector" in refused("track", *words, "--colour", "orange", "--force")

@@ -38,7 +38,7 @@ from tests.faults.bombs_of_tables import TABLES
 from tests.faults.large_files import LARGE
 from tests.faults.readers import reader_of
 from tests.faults.seeds import write_reader
-from tests.faults.worker import verdict
+from tests.faults.worker import in_a_process, verdict
 
 SECONDS = 2.0
 MEMORY = 300e6
@@ -142,21 +142,6 @@ def measured(read: Callable[[], object], place: str) -> Outcome:
         *found, memory = json.loads(said)
         return Outcome(*found, memory + 1e6 * started)
     return Outcome("fault", f"ended by signal {os.WTERMSIG(status)}", float(GIVEN_UP), float(GIVEN_UP), 0.0)
-
-
-def in_a_process(work: Callable[[], object]) -> None:
-    """Runs something whose memory and threads must not be there when this process forks. Raises: RuntimeError."""
-    child = os.fork()
-    if not child:
-        status = 1
-        try:
-            work()
-            status = 0
-        finally:
-            sys.stderr.flush()
-            os._exit(status) if status == 0 else None
-    if os.waitpid(child, 0)[1]:
-        raise RuntimeError("a file could not be written")
 
 
 def _read(name: str, place: Path, file: Path) -> object:

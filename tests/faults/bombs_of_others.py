@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import sqlite3
 import struct
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile
@@ -13,8 +12,8 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import cv2
 import numpy as np
 
-Write = Callable[[Path], object]
-Bomb = tuple[str, str, Write]
+from tests.faults.bombs_of_arrays import Bomb, Write
+
 SIDE = 20_000
 """px."""
 

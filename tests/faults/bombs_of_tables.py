@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ballfg.state import SIGMA_NAMES, STATE_NAMES
+from tests.faults.bombs_of_arrays import Bomb, Write
 
-Write = Callable[[Path], object]
-Bomb = tuple[str, str, Write]
 LONG = 1_000_000
 """Characters of a name."""
 ROWS = 1500

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import gzip
 import hashlib
-import os
 import random
 import shutil
 import sys
@@ -26,7 +25,7 @@ from tests.faults.mutations import damaged
 from tests.faults.odd_seeds import write_odd
 from tests.faults.readers import reader_of
 from tests.faults.seeds import write_seeds
-from tests.faults.worker import Worker, verdict
+from tests.faults.worker import Worker, in_a_process, verdict
 
 CORPUS = Path(__file__).with_name("corpus")
 LARGEST = 64_000
@@ -52,7 +51,7 @@ class Fuzzer:
 
     def __init__(self, folder: Path, only: str = "") -> None:
         self._seeds, self._odd, self._place = folder / "seeds", folder / "odd", folder / "cases"
-        _in_a_process(self._write)
+        in_a_process(self._write)
         shutil.copytree(self._seeds, self._place, symlinks=True)
         self.files = sorted(
             (place.name, str(file.relative_to(place)))
@@ -154,21 +153,6 @@ def _keep(corpus: Path, reader: str, name: str, content: bytes) -> None:
     if len(packed) <= LARGEST:
         digest = hashlib.sha256(content).hexdigest()[:8]
         (corpus / f"{reader}__{name.replace('/', '+')}__{digest}.gz").write_bytes(packed)
-
-
-def _in_a_process(work: object) -> None:
-    """Runs something whose threads must not be there when this process forks. Raises: RuntimeError: it failed."""
-    child = os.fork()
-    if not child:
-        status = 1
-        try:
-            work()  # type: ignore[operator]
-            status = 0
-        finally:
-            sys.stderr.flush()
-            os._exit(status) if status == 0 else None
-    if os.waitpid(child, 0)[1]:
-        raise RuntimeError("the good files could not be written")
 
 
 def main() -> int:

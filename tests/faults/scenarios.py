@@ -23,14 +23,13 @@ from ballfg.learning.run.training import run_training
 from ballfg.learning.sequence.data import LauncherSettings
 from ballfg.learning.sequence.predictor import SequenceArchitecture, SequencePredictor
 from ballfg.tracks import read_dataset
-from ballfg.vision import Camera
 from ballfg.vision.calibration.table_points import table_points
 from ballfg.vision.camera_file import read_cameras, write_cameras
 from tests.cli.test_calibrate_cameras import CENTRES, standing
 from tests.faults.folders import nothing
 from tests.faults.kills import Scenario, succeed
+from tests.vision.filming import level
 
-SIZE = (320, 180)
 TRACKS = ("--tracks", 2, "--settings", "topspin=1,sidespin=1,speed=9")
 OFFERED = "Replace it with --force"
 
@@ -96,17 +95,7 @@ IMPORT = (
 # --- cameras -------------------------------------------------------------------------------------------------------
 
 
-def camera(name: str, turn: float) -> Camera:
-    """2.5 m from the near end of the table, looking at it level, from a direction about z."""
-    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    about_z = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-    rotation = upright @ about_z
-    tvec = np.array([0.0, 0.0, 2.5]) - rotation @ (0.0, 0.0, 1.0)
-    matrix = [[250.0, 0.0, 159.5], [0.0, 250.0, 89.5], [0.0, 0.0, 1.0]]
-    return Camera(name, SIZE, matrix, np.zeros(5), cv2.Rodrigues(rotation)[0].ravel(), tvec)
-
-
-RIG = [camera("left", -0.7), camera("right", 0.8)]
+RIG = [level("left", -0.7, 2.5, 1.0, 0.5), level("right", 0.8, 2.5, 1.0, 0.5)]
 
 
 def filmed(folder: Path) -> None:

@@ -8,6 +8,7 @@ import os
 import resource
 import select
 import signal
+import sys
 import time
 import traceback
 import warnings
@@ -54,6 +55,21 @@ def verdict(read: Callable[[], object], names: tuple[str, ...]) -> tuple[str, st
         own = [frame for frame in place if "ballfg" in frame.filename or "learning" in frame.filename] or place
         return "fault", f"{type(error).__name__} in {Path(own[-1].filename).name}:{own[-1].lineno}: {error!s:.300}"
     return "read", ""
+
+
+def in_a_process(work: Callable[[], object]) -> None:
+    """Runs something whose memory and threads must not be there when this process forks. Raises: RuntimeError."""
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            work()
+            status = 0
+        finally:
+            sys.stderr.flush()
+            os._exit(status) if status == 0 else None
+    if os.waitpid(child, 0)[1]:
+        raise RuntimeError("a file could not be written")
 
 
 class Worker:

@@ -34,6 +34,16 @@ def looking(name: str, centre: Sequence[float], target: Sequence[float] = TARGET
     return Camera(name=name, rvec=rvec, tvec=-rotation @ np.asarray(centre), **settings)
 
 
+def level(name: str, turn: float, away: float, height: float = 0.0, scale: float = 1.0) -> Camera:
+    """A camera `away` m from a point `height` m above the origin, looking at it level, from a direction about z."""
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    about_z = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    rotation, (width, height_px) = upright @ about_z, (round(640 * scale), round(360 * scale))
+    matrix = [[500.0 * scale, 0.0, (width - 1) / 2], [0.0, 500.0 * scale, (height_px - 1) / 2], [0.0, 0.0, 1.0]]
+    tvec = np.array([0.0, 0.0, away]) - rotation @ (0.0, 0.0, height)
+    return Camera(name, (width, height_px), matrix, np.zeros(5), cv2.Rodrigues(rotation)[0].ravel(), tvec)
+
+
 def rig() -> list[Camera]:
     return [looking(name, centre) for name, centre in zip(("left", "right", "far"), CENTRES, strict=True)]
 

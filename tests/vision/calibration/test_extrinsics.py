@@ -13,20 +13,14 @@ import pytest
 from ballfg.vision import Camera
 from ballfg.vision.calibration.extrinsics import Extrinsics, calibrate_extrinsics
 from ballfg.vision.calibration.table_points import Marked, read_table, table_outline, table_points
+from tests.vision.filming import looking
 
 AT = table_points()
 CORNERS = ("near_left", "near_right", "far_left", "far_right")
 
 
 def standing(centre: tuple[float, float, float], target: tuple[float, float, float] = (1.37, 0.0, 0.76)) -> Camera:
-    forward = np.array(target) - centre
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    rotation = np.stack((right, np.cross(forward, right), forward))
-    matrix = [[800.0, 0, 640], [0, 805, 360], [0, 0, 1]]
-    bent = [-0.2, 0.05, 0.001, -0.002, 0.01]
-    return Camera("left", (1280, 720), matrix, bent, cv2.Rodrigues(rotation)[0], -rotation @ np.array(centre))
+    return looking("left", centre, target, matrix=[[800.0, 0, 640], [0, 805, 360], [0, 0, 1]])
 
 
 PLACES = [(-1.5, 2.2, 2.1), (1.37, -3.0, 1.9), (4.4, 1.5, 1.4), (1.3, 0.1, 4.0)]

@@ -14,7 +14,6 @@ from matplotlib.collections import EllipseCollection
 from numpy.typing import NDArray
 
 from ballfg.tracks.sightings import Sightings
-from ballfg.vision import Camera
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.tracking.contact_sheet import EXPOSURES, MOST_TRACKS, WIDTH, ContactSheet, View
@@ -34,6 +33,7 @@ from ballfg.vision.tracking.overlay import (
     write_overlay,
 )
 from ballfg.vision.tracking.pipeline import Tracking
+from tests.vision.filming import level
 
 SIZE = (640, 360)
 RATE = 100.0
@@ -44,15 +44,7 @@ DEPTH = 0.05
 BACKGROUND, BALL = (60, 90, 70), (240, 250, 245)
 
 
-def camera(name: str, turn: float) -> Camera:
-    """2 m from the origin, looking at it along +y, then turned about z."""
-    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    about_z = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-    matrix = [[500.0, 0.0, 319.5], [0.0, 500.0, 179.5], [0.0, 0.0, 1.0]]
-    return Camera(name, SIZE, matrix, np.zeros(5), cv2.Rodrigues(upright @ about_z)[0].ravel(), [0.0, 0.0, 2.0])
-
-
-RIG = (camera("left", -0.6), camera("right", 0.6))
+RIG = (level("left", -0.6, 2.0), level("right", 0.6, 2.0))
 
 
 def centre(times: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -25,6 +25,7 @@ from ballfg.vision.tracking.dataset import FILES, check_result_folder, write_tra
 from ballfg.vision.tracking.overlay import Image
 from ballfg.vision.tracking.pipeline import Tracking, no_ball, summary, track_detections
 from tests.places import DOCS
+from tests.vision.filming import level
 
 RATE = 100.0
 FRAMES, START, END = 80, 20, 60
@@ -33,16 +34,7 @@ INFO = DatasetInfo("made", 0.0, TABLE_TENNIS)
 WRITTEN = set(FILES) - {"overlay.mp4", "states.csv", "events.csv"}
 
 
-def camera(name: str, turn: float) -> Camera:
-    """2.5 m from the origin, looking at it level, from a direction about z."""
-    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    about_z = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-    matrix = [[500.0, 0.0, 319.5], [0.0, 500.0, 179.5], [0.0, 0.0, 1.0]]
-    rvec = cv2.Rodrigues(upright @ about_z)[0].ravel()
-    return Camera(name, (640, 360), matrix, np.zeros(5), rvec, [0.0, 0.0, 2.5])
-
-
-RIG = [camera("left", -0.7), camera("middle", 0.1), camera("right", 0.8)]
+RIG = [level("left", -0.7, 2.5), level("middle", 0.1, 2.5), level("right", 0.8, 2.5)]
 
 
 def centre(times: np.ndarray) -> np.ndarray:
