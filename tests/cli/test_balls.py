@@ -13,12 +13,11 @@ from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.simulation.balls import ball_kind
 from ballfg.tracks import Ball
-from tests.commands import status
+from tests.commands import printed, refused, status
 
 
-def test_the_list(capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("balls") == 0
-    header, *lines = capsys.readouterr().out.splitlines()
+def test_the_list() -> None:
+    header, *lines = printed("balls").out.splitlines()
     assert header.split()[:5] == ["name", "radius", "mm", "mass", "g"]
     assert [line.split()[0] for line in lines] == list(KNOWN_BALLS)
     (basketball,) = [line.split() for line in lines if line.startswith("basketball")]
@@ -32,28 +31,24 @@ def basketball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_the_ball_of_the_dataset_is_named(basketball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_ball_of_the_dataset_is_named(basketball: Path, tmp_path: Path) -> None:
     named, plain = tmp_path / "named.csv", tmp_path / "plain.csv"
-    assert status("estimate", basketball, "--ball", "basketball", "--jobs", 1, "--out", named) == 0
-    assert status("estimate", basketball, "--jobs", 1, "--out", plain) == 0
+    for words in (("--ball", "basketball", "--out", named), ("--out", plain)):
+        assert "no nominal model" not in printed("estimate", basketball, "--jobs", 1, *words).err
     assert named.read_bytes() == plain.read_bytes()  # the dataset's own ball wins, named or not
-    assert "no nominal model" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["estimate", "predict", "live"])
-def test_another_ball_is_refused(
-    command: str, basketball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_ball_is_refused(command: str, basketball: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     words = {
         "estimate": ["estimate", basketball, "--out", out],
         "predict": ["predict", basketball, "--observe", 0.3, "--out", out],
         "live": ["live", "--replay", basketball, "--out", tmp_path / "out.jsonl"],
     }
-    assert status(*words[command], "--ball", "tennis") == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert "--ball tennis has a radius of 0.0335 m and 0.0577 kg" in line
-    assert "states 0.121 m and 0.6 kg" in line
+    said = refused(*words[command], "--ball", "tennis")
+    assert "--ball tennis has a radius of 0.0335 m and 0.0577 kg" in said
+    assert "states 0.121 m and 0.6 kg" in said
     assert not out.exists()
 
 
@@ -79,9 +74,8 @@ def test_a_ball_file_is_the_ball_of_a_dataset(command: str, basketball: Path, tm
     assert made["same"] == made["none"] != made["own"]
 
 
-def test_a_shuttle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("simulate", "--ball", "badminton", "--out", tmp_path / "shots") == 2
-    assert "a badminton shuttle is no ball" in capsys.readouterr().err
+def test_a_shuttle(tmp_path: Path) -> None:
+    assert "a badminton shuttle is no ball" in refused("simulate", "--ball", "badminton", "--out", tmp_path / "shots")
 
 
 def test_a_stream_without_a_dataset_is_of_the_ball_that_is_named() -> None:

@@ -9,7 +9,7 @@ import pytest
 from ballfg.dynamics.compiled.kept import cache_folder
 from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.simulation import SimulationConfig, write_simulation
-from tests.commands import status
+from tests.commands import printed, refused
 from tests.interpreter import Interpreter
 
 MODEL = "flight: {gravity: {}, drag: {k: 0.1}, wind: {x: 1.0}}\nbounce: {restitution: {e: 0.9}}\n"
@@ -38,17 +38,12 @@ def test_nothing_is_generated_after_it(tmp_path: Path, monkeypatch: pytest.Monke
         assert ran(ballfg, "live", "--replay", "shots", "--model", "model.yaml", "--speed", "100") == made
 
 
-def test_the_balls_that_ship(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_balls_that_ship(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of them: each takes as long as any other."""
     two = ("table_tennis", "tennis")
     monkeypatch.setattr("ballfg.dynamics.known_balls.KNOWN_BALLS", {name: KNOWN_BALLS[name] for name in two})
-    assert status("compile") == 0
-    assert capsys.readouterr().out == f"{', '.join(two)}: compiled, and kept in {cache_folder()}\n"
+    assert printed("compile").out == f"{', '.join(two)}: compiled, and kept in {cache_folder()}\n"
 
 
-def test_a_model_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("compile", "--model", "none.yaml") == 2
-    said = capsys.readouterr()
-    assert said.err.startswith("ballfg: error: ")
-    assert said.err.count("\n") == 1
-    assert "none.yaml" in said.err
+def test_a_model_that_is_not_there() -> None:
+    assert "none.yaml" in refused("compile", "--model", "none.yaml")

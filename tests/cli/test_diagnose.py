@@ -15,7 +15,7 @@ from ballfg.dynamics import AnalyticModel, Architecture, build, load_model, nomi
 from ballfg.progress import VARIABLE
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset
-from tests.commands import status
+from tests.commands import printed, refused, status
 from tests.diagnosis.made_diagnosis import found, silent, unexplained
 
 Asked = list[tuple[str, tuple[str, ...], int]]
@@ -59,19 +59,14 @@ def answer(monkeypatch: pytest.MonkeyPatch) -> Answer:
 
 
 def test_what_is_printed_and_written(
-    dataset: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    answer: Answer,
-    monkeypatch: pytest.MonkeyPatch,
+    dataset: Path, tmp_path: Path, answer: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv(VARIABLE)
     asked = answer(found())
     out = tmp_path / "diagnosis"
-    assert status("diagnose", dataset, "--model", dataset / "model.yaml", "--out", out, "--jobs", 2) == 0
+    said = printed("diagnose", dataset, "--model", dataset / "model.yaml", "--out", out, "--jobs", 2)
     ((_, effects, jobs),) = asked
     assert (effects[:2], jobs) == (("gravity", "drag"), 2)
-    said = capsys.readouterr()
     assert said.err.startswith("fitting the declared model to 25 tracks\n")
     first, *lines = said.out.splitlines()
     assert first == headline(found())
@@ -88,78 +83,55 @@ def test_what_is_printed_and_written(
     assert sorted(path.name for path in out.iterdir()) == NAMES
 
 
-def test_other_verdicts(
-    dataset: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    answer: Answer,
-) -> None:
+def test_other_verdicts(dataset: Path, tmp_path: Path, answer: Answer) -> None:
     answer(silent())
-    assert status("diagnose", dataset, "--out", tmp_path / "a") == 0
-    said = capsys.readouterr().out
+    said = printed("diagnose", dataset, "--out", tmp_path / "a").out
     assert said.startswith(f"{headline(silent())}\nnothing lacking: Nothing is lacking")
     assert "effect " not in said
     answer(unexplained())
-    assert status("diagnose", dataset, "--out", tmp_path / "a") == 2
-    refused(capsys, "out must be new or empty; ")
+    assert "out must be new or empty; " in refused("diagnose", dataset, "--out", tmp_path / "a")
     assert json.loads((tmp_path / "a" / "report.json").read_text(encoding="utf-8"))["verdict"] == "nothing lacking"
-    assert status("diagnose", dataset, "--out", tmp_path / "a", "--force") == 0
-    said = capsys.readouterr().out
+    said = printed("diagnose", dataset, "--out", tmp_path / "a", "--force").out
     assert "left unexplained: In flight, along the motion" in said
     assert "  sparse terms: 0.31 t |v| v; prediction RMSE 11.8 mm with it" in said
     assert json.loads((tmp_path / "a" / "report.json").read_text(encoding="utf-8"))["verdict"] == "unexplained"
 
 
-def test_a_learned_model_is_refused(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], answer: Answer
-) -> None:
+def test_a_learned_model_is_refused(dataset: Path, tmp_path: Path, answer: Answer) -> None:
     asked = answer(found())
     model = build(Architecture(kind="mnn+gs", width_flight=4, width_contact=4, depth=1), radius=0.02)
     save_model(model, tmp_path / "learned.yaml")
     out = tmp_path / "diagnosis"
-    assert status("diagnose", dataset, "--model", tmp_path / "learned.yaml", "--out", out) == 2
-    refused(capsys, "--model must be analytic: a diagnosis adds physical effects to it; ")
+    assert "--model must be analytic: a diagnosis adds physical effects to it; " in refused(
+        "diagnose", dataset, "--model", tmp_path / "learned.yaml", "--out", out
+    )
     assert not out.exists()
     assert asked == []
 
 
-def test_places_that_are_refused(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], answer: Answer
-) -> None:
+def test_places_that_are_refused(dataset: Path, tmp_path: Path, answer: Answer) -> None:
     asked = answer(found())
     before = sorted(dataset.iterdir())
-    assert status("diagnose", dataset, "--out", dataset) == 2
-    refused(capsys, "out must not be the dataset itself; got ")
+    assert "out must not be the dataset itself; got " in refused("diagnose", dataset, "--out", dataset)
     (tmp_path / "notes.txt").write_text("mine")
-    assert status("diagnose", dataset, "--out", tmp_path) == 2
-    refused(capsys, "out must be new, empty or hold an earlier report; ")
+    assert "out must be new, empty or hold an earlier report; " in refused("diagnose", dataset, "--out", tmp_path)
     out = tmp_path / "earlier"
     out.mkdir()
     save_model(nominal_model(), out / "model.yaml")
     (out / "report.json").write_text("{}")
-    assert status("diagnose", dataset, "--model", out / "model.yaml", "--out", out) == 2
-    refused(capsys, "out must not hold the model itself; ")
+    assert "out must not hold the model itself; " in refused(
+        "diagnose", dataset, "--model", out / "model.yaml", "--out", out
+    )
     assert status("diagnose", tmp_path / "nowhere", "--out", tmp_path / "new") == 2
     assert sorted(dataset.iterdir()) == before
     assert not (tmp_path / "new").exists()
     assert asked == []
 
 
-def refused(capsys: pytest.CaptureFixture[str], message: str) -> None:
-    said = capsys.readouterr()
-    assert (said.out, said.err.count("\n")) == ("", 1)
-    assert said.err.startswith(f"ballfg: error: {message}")
-
-
-def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("diagnose", "--help") == 0
-    assert "ballfg diagnose data/aimy --model model.yaml --out diagnosis" in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_whole_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_whole_run(dataset: Path, tmp_path: Path) -> None:
     """On tracks of the declared model: a report whose error is about the noise, and a model that can be read."""
     out = tmp_path / "diagnosis"
-    assert status("diagnose", dataset, "--model", dataset / "model.yaml", "--out", out, "--jobs", 1) == 0
+    said = printed("diagnose", dataset, "--model", dataset / "model.yaml", "--out", out, "--jobs", 1)
     # what was found out about the noise lies in a folder beside the model
     assert sorted(path.name for path in out.iterdir() if path.is_file()) == NAMES
     assert [path.name.split("-")[0] for path in out.iterdir() if path.is_dir()] == ["model.learned"]
@@ -168,4 +140,4 @@ def test_a_whole_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert report["effects"] == []
     assert 3.0 < report["error"]["before"]["prediction_rmse_mm"] < 60.0
     assert isinstance(load_model(out / "model.yaml"), AnalyticModel)
-    assert "\nnothing lacking: " in capsys.readouterr().out
+    assert "\nnothing lacking: " in said.out

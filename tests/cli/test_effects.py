@@ -11,7 +11,7 @@ import yaml
 
 import ballfg.diagnosis
 from ballfg.dynamics import EFFECTS
-from tests.commands import status
+from tests.commands import printed, refused, status
 from tests.places import DOCS
 
 GUIDE = DOCS / "add_an_effect.md"
@@ -27,7 +27,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield tmp_path
 
 
-def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     """As they stand there, with fewer tracks; the search itself is tested elsewhere."""
     asked = []
 
@@ -39,8 +39,7 @@ def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     commands = re.findall(r"^ballfg (.*--effects-file .*)$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
     simulate, search, predict = (command.replace("--tracks 50", "--tracks 2").split() for command in commands)
     with EFFECTS.restored():
-        assert status(*simulate) == 0
-    assert "undeclared effects: static_charge" in capsys.readouterr().out
+        assert "undeclared effects: static_charge" in printed(*simulate).out
     assert yaml.safe_load(Path("charged/truth.yaml").read_text(encoding="utf-8"))
     with EFFECTS.restored():
         assert status(*search) == 2
@@ -54,16 +53,13 @@ def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert Path("predictions.csv").is_file()
 
 
-def test_a_model_file_that_names_an_unknown_effect_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_model_file_that_names_an_unknown_effect_is_refused() -> None:
     assert status("simulate", "--out", "plain", "--tracks", 2) == 0
     Path("model.yaml").write_text("flight: {gravity: {}, static_charge: {strength: 1.0}}\nbounce: {}\n")
-    capsys.readouterr()
     arguments = ("estimate", "plain", "--model", "model.yaml", "--out", "states.csv")
-    assert status(*arguments) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith("ballfg: error: model.yaml: there is no flight effect 'static_charge'; known ones: ")
-    assert said.err.endswith("must be registered first: --effects-file FILE.py, or ballfg.dynamics.register.\n")
+    said = refused(*arguments)
+    assert said.startswith("ballfg: error: model.yaml: there is no flight effect 'static_charge'; known ones: ")
+    assert said.endswith("must be registered first: --effects-file FILE.py, or ballfg.dynamics.register.\n")
     assert not Path("states.csv").exists()
     assert status(*arguments, "--effects-file", "static_charge.py", "--effects-file", "static_charge.py") == 0
 
@@ -76,42 +72,31 @@ def test_a_model_file_that_names_an_unknown_effect_is_refused(capsys: pytest.Cap
         ("x = 1", "must define an effect, a class; it defines none. docs/add_an_effect.md has an example."),
     ],
 )
-def test_bad_files_are_one_line_and_status_2(
-    capsys: pytest.CaptureFixture[str], text: str | None, message: str
-) -> None:
+def test_bad_files_are_one_line_and_status_2(text: str | None, message: str) -> None:
     if text is not None:
         Path("broken.py").write_text(text, encoding="utf-8")
-    assert status("simulate", "--out", "d", "--effects-file", "broken.py") == 2
-    said = capsys.readouterr()
-    assert (said.out, said.err.count("\n")) == ("", 1)
-    assert said.err.startswith("ballfg: error: ")
-    assert said.err.endswith(f"{message}\n")
+    assert refused("simulate", "--out", "d", "--effects-file", "broken.py").endswith(f"{message}\n")
     assert not Path("d").exists()
 
 
 @pytest.mark.parametrize("words", [("--effects", "static_charge.py"), ("--effects=static_charge.py",)])
-def test_the_earlier_name_of_the_option_works(capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
+def test_the_earlier_name_of_the_option_works(words: tuple[str, ...]) -> None:
     """Also beside the name of today and beside `--effect`, which names an effect. Help shows only the name of today."""
     simulated = ("simulate", "--tracks", 2, "--effect", "static_charge.strength=2")
-    assert status(*simulated, "--out", "earlier", *words) == 0
-    assert status(*simulated, "--out", "both", *words, "--effects-file", "static_charge.py") == 0
-    assert capsys.readouterr().out.count("undeclared effects: static_charge") == 2
+    for options in (("--out", "earlier", *words), ("--out", "both", *words, "--effects-file", "static_charge.py")):
+        assert "undeclared effects: static_charge" in printed(*simulated, *options).out
     for command in ("estimate", "predict", "diagnose", "simulate", "render"):
-        assert status(command, "--help") == 0
-        said = capsys.readouterr().out
+        said = printed(command, "--help").out
         assert "--effects-file" in said
         assert not re.search(r"--effects(?!-file)", said)
 
 
-def test_all_that_is_known_of_an_effect_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("effects") == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_all_that_is_known_of_an_effect_is_told() -> None:
+    lines = printed("effects").out.splitlines()
     assert [line.split()[0] for line in lines] == list(EFFECTS)
-    assert status("effects", "wind", "drag_speed") == 0
-    said = " ".join(capsys.readouterr().out.split())
+    said = " ".join(printed("effects", "wind", "drag_speed").out.split())
     for effect in (EFFECTS["wind"], EFFECTS["drag_speed"]):
         for words in (effect.sentence, effect.decide, effect.plain, effect.usual.source, effect.plausible.source):
             assert words in said
     assert "needs: drag" in said
-    assert status("effects", "wnd") == 2
-    assert "there is no effect 'wnd'" in capsys.readouterr().err
+    assert "there is no effect 'wnd'" in refused("effects", "wnd")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.cli.start import BAD_INPUT, NO_MEMORY, guarded
-from tests.commands import status
+from tests.commands import printed
 from tests.places import ROOT
 
 
@@ -56,10 +56,9 @@ def test_torch_is_refused_more_memory_than_there_is():
         torch.empty(2**58, dtype=torch.uint8)
 
 
-def test_a_name_that_is_no_text_is_refused_before_anything_is_done(tmp_path, capsys):
+def test_a_name_that_is_no_text_is_refused_before_anything_is_done(tmp_path):
     name = os.fsdecode(bytes(tmp_path / "shots") + b"\xff")
-    assert status("simulate", "--out", name, "--tracks", "2") == BAD_INPUT
-    assert r"shots\udcff'. Rename" in capsys.readouterr().err
+    assert r"shots\udcff'. Rename" in printed("simulate", "--out", name, "--tracks", "2", status=BAD_INPUT).err
     assert not list(tmp_path.iterdir())
 
 

@@ -8,15 +8,12 @@ import pytest
 import yaml
 
 from ballfg.tracks import read_dataset
-from tests.commands import status
+from tests.commands import printed, refused, status
 
 
-def test_two_datasets_and_what_to_do_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_datasets_and_what_to_do_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert status("example", "--tracks", 6) == 0
-    said = capsys.readouterr().out
+    said = printed("example", "--tracks", 6).out
     names = {"shots": set(), "windy": {"wind"}}
     for name, undeclared in names.items():
         folder = Path("example") / name
@@ -33,14 +30,11 @@ def test_two_datasets_and_what_to_do_next(
     assert "BSD-3-Clause" in said
 
 
-def test_earlier_examples_stay_unless_forced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_earlier_examples_stay_unless_forced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert status("example", "--tracks", 6) == 0
     before = (Path("example") / "shots" / "tracks.csv").read_bytes()
-    assert status("example", "--tracks", 6, "--seed", 1) == 2
-    assert "--force" in capsys.readouterr().err
+    assert "--force" in refused("example", "--tracks", 6, "--seed", 1)
     assert (Path("example") / "shots" / "tracks.csv").read_bytes() == before
     assert status("example", "--tracks", 6, "--seed", 1, "--force") == 0
     assert (Path("example") / "shots" / "tracks.csv").read_bytes() != before

@@ -22,7 +22,7 @@ from ballfg.estimation import Online, Settings, dataset_settings, dataset_surfac
 from ballfg.live.session import Session
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
-from tests.commands import status
+from tests.commands import printed, refused
 from tests.live.test_recording import disk_of
 
 SAMPLES = 14
@@ -68,14 +68,11 @@ def csv(dataset: Path, number: int, later: float = 0.0) -> list[bytes]:
     return [f"{t + later},{x},{y},{z}\n".encode() for t, (x, y, z) in zip(track.times, track.positions, strict=True)]
 
 
-def test_a_replay_gives_the_states_of_the_online_estimator(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_replay_gives_the_states_of_the_online_estimator(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "states.jsonl"
     arguments = ("--replay", dataset, "--speed", 0, "--plane", "x=1.0", "--horizon", 0.5, "--out", out)
-    assert status("live", *arguments) == 0
-    printed, text = capsys.readouterr()
-    assert printed == ""
+    said = printed("live", *arguments)
+    assert said.out == ""
     lines = lines_of(out.read_bytes())
     assert [path.name for path in tmp_path.iterdir()] == ["states.jsonl"]
     for number in (0, 1):
@@ -93,8 +90,10 @@ def test_a_replay_gives_the_states_of_the_online_estimator(
         assert states[-1]["note"] == ""
     others = [line["kind"] for line in lines if line["kind"] != "state"]
     assert others == ["newcomer", "newcomer", "newcomer", "lost", "newcomer", "lost"]  # the second stamp tells
-    assert re.search(r"latency of 24 lines: median [\d.]+ ms, 99 % [\d.]+ ms, 99.9 % [\d.]+ ms, worst [\d.]+ ms", text)
-    assert "28 positions, 2 balls; 0 late, 0 too old, 0 repeated, 0 malformed, 0 dropped" in text
+    assert re.search(
+        r"latency of 24 lines: median [\d.]+ ms, 99 % [\d.]+ ms, 99.9 % [\d.]+ ms, worst [\d.]+ ms", said.err
+    )
+    assert "28 positions, 2 balls; 0 late, 0 too old, 0 repeated, 0 malformed, 0 dropped" in said.err
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.thorough)])
@@ -185,27 +184,21 @@ def test_a_closed_pipe_ends_it_cleanly(dataset: Path) -> None:
     assert "balls; " in said
 
 
-def test_a_full_disk_ends_it_with_one_line_and_the_recording_stays(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_ends_it_with_one_line_and_the_recording_stays(dataset: Path, tmp_path: Path) -> None:
     out = tmp_path / "states.jsonl"
     with disk_of(20_000):
-        assert status("live", "--replay", dataset, "--speed", 0, "--out", out) == 2
-    said = capsys.readouterr().err.splitlines()
-    assert (
-        said[-1] == f"ballfg: error: {out}: File too large. Check the path, its permissions and the space on the disk."
-    )
+        said = printed("live", "--replay", dataset, "--speed", 0, "--out", out, status=2).err
+    assert said.endswith(f"error: {out}: File too large. Check the path, its permissions and the space on the disk.\n")
     content = out.read_bytes()
     assert content.endswith(b"}\n")
     assert 15_000 < len(content) <= 20_000
     assert [line["kind"] for line in lines_of(content)][:3] == ["newcomer", "newcomer", "state"]
-    assert status("live", "--replay", dataset, "--speed", 0, "--out", out) == 2
-    assert "out must be a new file for a replay" in capsys.readouterr().err
+    assert "out must be a new file for a replay" in refused("live", "--replay", dataset, "--speed", 0, "--out", out)
     assert out.read_bytes() == content
 
 
 def test_an_interrupt_in_the_middle_of_a_sample_keeps_the_recording(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A second Ctrl-C raises wherever the program is."""
     tell, told = Session._tell, []
@@ -218,9 +211,9 @@ def test_an_interrupt_in_the_middle_of_a_sample_keeps_the_recording(
 
     monkeypatch.setattr(Session, "_tell", interrupted)
     out = tmp_path / "states.jsonl"
-    assert status("live", "--replay", dataset, "--speed", 0, "--out", out) == 130
+    said = printed("live", "--replay", dataset, "--speed", 0, "--out", out, status=130).err
     assert len(lines_of(out.read_bytes())) == 5
-    assert capsys.readouterr().err.endswith("ballfg: interrupted\n")
+    assert said.endswith("ballfg: interrupted\n")
 
 
 @pytest.mark.parametrize(
@@ -241,15 +234,8 @@ def test_an_interrupt_in_the_middle_of_a_sample_keeps_the_recording(
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    arguments: list[str],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert status("live", *arguments) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"ballfg: error: {message}")
-    assert said.count("\n") == 1
+    assert refused("live", *arguments).startswith(f"ballfg: error: {message}")
     assert list(tmp_path.iterdir()) == []

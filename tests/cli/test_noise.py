@@ -13,7 +13,7 @@ from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, w
 from ballfg.tracks import TABLE_TENNIS, read_dataset
 from ballfg.tracks.info import DatasetInfo, write_info
 from ballfg.vision.camera_file import write_cameras
-from tests.commands import status
+from tests.commands import printed, refused, status
 from tests.estimation.observations.sighted_rig import RIG, TABLE, scene, world
 from tests.written_tables import write_sightings
 
@@ -25,10 +25,9 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_table_and_files(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_and_files(shots: Path, tmp_path: Path) -> None:
     out = tmp_path / "noisy.yaml"
-    assert status("noise", shots, "--model", shots / "model.yaml", "--tracks", 8, "--out", out, "--write") == 0
-    said = capsys.readouterr().out
+    said = printed("noise", shots, "--model", shots / "model.yaml", "--tracks", 8, "--out", out, "--write").out
     assert f"{shots}: noise from 8 tracks" in said
     assert "error of a position that lasts, along x" in said
     assert "90 % intervals of these forecasts hold" in said
@@ -39,16 +38,13 @@ def test_table_and_files(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert status("predict", shots, "--model", out, "--observe", 0.3, "--jobs", 1, "--out", tmp_path / "p.csv") == 0
 
 
-def test_exact_positions_are_no_doubt_and_show_all_other_noise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_exact_positions_are_no_doubt_and_show_all_other_noise(tmp_path: Path) -> None:
     """Of another simulator, for instance: the positions are known to be better than any tracker's."""
     folder, process = tmp_path / "exact", MotionNoise(acceleration=0.05)
     config = SimulationConfig(8, 100.0, seed=3, noise=MeasurementNoise(position=1e-9), process=process)
     write_simulation(folder, config)
     write_info(folder / "dataset.yaml", replace(read_dataset(folder).info, position_noise=None))
-    assert status("noise", folder) == 0
-    said = capsys.readouterr()
+    said = printed("noise", folder)
     assert "a filter smoothed" not in said.out + said.err
     white = re.findall(r"new in each sample.*\(below ([\d.]+)\)", said.out)
     assert len(white) == 3
@@ -58,13 +54,12 @@ def test_exact_positions_are_no_doubt_and_show_all_other_noise(
     assert float(found[1]) == pytest.approx(0.05, rel=0.2)
 
 
-def test_written_noise_is_no_prior_of_the_next_one(shots: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_written_noise_is_no_prior_of_the_next_one(shots: Path) -> None:
     """The same tracks are counted once, however often the noise is written: a prior of them would move every number."""
     said, stated = [], []
     before = (shots / "dataset.yaml").read_bytes()
     for _ in range(2):
-        assert status("noise", shots, "--model", shots / "model.yaml", "--tracks", 8, "--write") == 0
-        said.append(capsys.readouterr().out)
+        said.append(printed("noise", shots, "--model", shots / "model.yaml", "--tracks", 8, "--write").out)
         stated.append(read_dataset(shots).info.noise)
     assert stated[0] == stated[1]
     tables = [[line for line in lines.splitlines() if "so far" not in line] for lines in said]
@@ -84,22 +79,20 @@ def test_written_noise_is_no_prior_of_the_next_one(shots: Path, capsys: pytest.C
         (["SHOTS", "--tracks", "2"], "'--tracks'"),
     ],
 )
-def test_bad_input(shots: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str) -> None:
+def test_bad_input(shots: Path, words: list[str], message: str) -> None:
     before = {path: path.read_bytes() for path in shots.iterdir()}
-    assert status("noise", *(word.replace("SHOTS", str(shots)) for word in words)) == 2
-    assert message in capsys.readouterr().err
+    assert message in refused("noise", *(word.replace("SHOTS", str(shots)) for word in words))
     assert {path: path.read_bytes() for path in shots.iterdir()} == before
 
 
-def test_pixels_of_each_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pixels_of_each_camera(tmp_path: Path) -> None:
     """Without a table of tracks no option is needed; neither a model file nor dataset.yaml could hold the noise."""
     write_info(tmp_path / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
     write_cameras(tmp_path / "cameras.yaml", RIG)
     shots = [(name, scene(seed, world(), duration=0.3).sightings) for seed, name in enumerate(("one", "two"))]
     write_sightings(tmp_path / "detections.csv", shots)
     files = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    assert status("noise", tmp_path) == 0
-    said = capsys.readouterr().out
+    said = printed("noise", tmp_path).out
     assert "noise of pixels from 2 tracks" in said
     found = re.findall(
         r"camera (\w+), (\d+) sightings\n +error .*axis +([\d.]+) x/: ([\d.]+)  px  \(stated 0.3\)", said
@@ -109,6 +102,5 @@ def test_pixels_of_each_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert all(0.2 < float(sigma) < 0.4 and float(factor) < 1.15 for *_, sigma, factor in found)
     assert "streak" not in said
     for words in (["--write"], ["--from", "detections", "--out", tmp_path / "model.yaml"]):
-        assert status("noise", tmp_path, *words) == 2
-        assert "--out and --write must be left out" in capsys.readouterr().err
+        assert "--out and --write must be left out" in refused("noise", tmp_path, *words)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == files

@@ -9,7 +9,7 @@ from ballfg.cli.main import app
 from ballfg.cli.start import _command
 from ballfg.tracks import TABLE_TENNIS, Track, write_dataset
 from ballfg.tracks.info import DatasetInfo
-from tests.commands import status
+from tests.commands import refused
 
 WORDS = {
     "import": "{data}/tracks.csv --out {out}",
@@ -45,13 +45,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("command", "option"), _options())
-def test_what_is_no_number_is_refused(
-    command: str, option: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_number_is_refused(command: str, option: str, data: Path, tmp_path: Path) -> None:
     words = [word.format(data=data, out=tmp_path / "out") for word in WORDS[command].split()]
     for value in ("nan",) if option in MAY_BE_INFINITE else ("nan", "1e400", "-1e400"):
-        assert status(command, *words, f"{option}={value}") == 2
-        said = capsys.readouterr().err
+        said = refused(command, *words, f"{option}={value}")
         assert said.count("ballfg: error: ") == 1
         assert "got nan" in said or "got inf" in said or "got -inf" in said, said
         assert not list(tmp_path.iterdir())

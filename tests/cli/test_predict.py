@@ -21,7 +21,7 @@ from ballfg.prediction.event_ahead import event_numbers
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Ball, Dataset, Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
-from tests.commands import status
+from tests.commands import printed, refused, status
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")
 COLUMNS = ["trajectory", "t", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z"]
@@ -36,24 +36,23 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.mark.parametrize("gust", [0.0, 6.0])
-def test_intervals_that_the_tracks_contradict(gust: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_intervals_that_the_tracks_contradict(gust: float, tmp_path: Path) -> None:
     """A gust (m/s^2) that begins after the observed part; six tracks are too few to show their noise."""
     t, tracks = np.arange(60) / 100.0, []
     for seed in range(6):
         p = np.stack((3.0 * t, 0.5 * gust * np.maximum(t - 0.3, 0.0) ** 2, 1.0 + 4.0 * t - 4.905 * t**2), axis=1)
         tracks.append(Track(t, p + np.random.default_rng(seed).normal(0.0, 0.002, p.shape), name=f"{seed}"))
     write_dataset(tmp_path / "throws", DatasetInfo("throws", None, Ball(0.0335, 0.0577), position_noise=0.002), tracks)
-    assert status("predict", tmp_path / "throws", "--observe", 0.3, "--out", tmp_path / "p.csv") == 0
-    assert ("of what was measured there; widen them with --conformal" in capsys.readouterr().out) == (gust > 0.0)
+    assert (
+        "of what was measured there; widen them with --conformal"
+        in printed("predict", tmp_path / "throws", "--observe", 0.3, "--out", tmp_path / "p.csv").out
+    ) == (gust > 0.0)
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_one_row_for_each_stamp_after_the_observed_part(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
-) -> None:
+def test_one_row_for_each_stamp_after_the_observed_part(dataset: Dataset, tmp_path: Path, method: str) -> None:
     out = tmp_path / "predictions.csv"
-    assert status("predict", dataset.path, "--method", method, "--observe", 0.3, "--out", out) == 0
-    said = capsys.readouterr()
+    said = printed("predict", dataset.path, "--method", method, "--observe", 0.3, "--out", out)
     notes = [line for line in said.err.splitlines() if not line.endswith("tracks predicted")]  # progress may show
     assert notes == []
     assert said.out.startswith(f"{out}: ")
@@ -85,25 +84,20 @@ def test_the_same_bytes_twice(dataset: Dataset, tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
-def test_tracks_that_end_too_early_are_counted(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tracks_that_end_too_early_are_counted(dataset: Dataset, tmp_path: Path) -> None:
     duration = sorted(t.duration for t in dataset)[2]
     command = ["predict", dataset.path, "--method", "sliding-window", "--out", tmp_path / "p.csv", "--observe"]
-    assert status(*command, duration) == 0
-    assert "3 of the tracks end within" in capsys.readouterr().out
-    assert status(*command, 60) == 0
-    said = capsys.readouterr().out
+    assert "3 of the tracks end within" in printed(*command, duration).out
+    said = printed(*command, 60).out
     assert ": 0 positions of 6 tracks" in said
     assert "RMSE" not in said
     assert (tmp_path / "p.csv").read_text() == ",".join(COLUMNS) + "\n"
 
 
-def test_what_went_wrong_is_said(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_went_wrong_is_said(dataset: Dataset, tmp_path: Path) -> None:
     """One sample tells no velocity: the status is not silent."""
     command = ["predict", dataset.path, "--method", "smoother", "--observe", 1e-3, "--out", tmp_path / "p.csv"]
-    assert status(*command) == 0
-    assert "  6 tracks: there are too few samples to tell a velocity" in capsys.readouterr().out
+    assert "  6 tracks: there are too few samples to tell a velocity" in printed(*command).out
 
 
 @pytest.mark.parametrize(
@@ -115,20 +109,16 @@ def test_what_went_wrong_is_said(dataset: Dataset, tmp_path: Path, capsys: pytes
         ("soon", "'--observe'"),
     ],
 )
-def test_bad_observe(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], observe: str, message: str
-) -> None:
-    assert status("predict", dataset.path, "--observe", observe, "--out", tmp_path / "p.csv") == 2
-    said = capsys.readouterr()
+def test_bad_observe(dataset: Dataset, tmp_path: Path, observe: str, message: str) -> None:
+    said = printed("predict", dataset.path, "--observe", observe, "--out", tmp_path / "p.csv", status=2)
     assert (said.out, said.err.count("\n")) == ("", 1)
     assert said.err.startswith("ballfg: error: ")
     assert message in said.err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_observe(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert status("predict", dataset.path, "--out", tmp_path / "p.csv") == 2
-    assert "--observe" in capsys.readouterr().err
+def test_missing_observe(dataset: Dataset, tmp_path: Path) -> None:
+    assert "--observe" in refused("predict", dataset.path, "--out", tmp_path / "p.csv")
 
 
 # --- conformal intervals
@@ -147,15 +137,13 @@ def sigmas(path: Path) -> np.ndarray:
 
 
 def test_conformal_sigmas_from_a_dataset_and_from_the_file_that_keeps_them(
-    dataset: Dataset, calibration: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dataset: Dataset, calibration: Dataset, tmp_path: Path
 ) -> None:
     names = ("plain.csv", "scaled.csv", "again.csv", "scales.yaml")
     plain, scaled, again, scales = (tmp_path / name for name in names)
     command = ["predict", dataset.path, "--observe", 0.3, "--method", "ekf", "--out"]
     assert status(*command, plain) == 0
-    capsys.readouterr()
-    assert status(*command, scaled, "--conformal", calibration.path, "--save-conformal", scales) == 0
-    said = capsys.readouterr()
+    said = printed(*command, scaled, "--conformal", calibration.path, "--save-conformal", scales)
     assert (
         "  90 % intervals on the 12 calibration tracks of 'simulated table-tennis': the model's own hold " in said.out
     )
@@ -172,12 +160,12 @@ def test_conformal_sigmas_from_a_dataset_and_from_the_file_that_keeps_them(
     assert pa_csv.read_csv(scaled).drop(COLUMNS[5:]).equals(pa_csv.read_csv(plain).drop(COLUMNS[5:]))
 
 
-def test_calibration_tracks_that_fail_are_reported(
-    dataset: Dataset, calibration: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_calibration_tracks_that_fail_are_reported(dataset: Dataset, calibration: Dataset, tmp_path: Path) -> None:
     command = ["predict", dataset.path, "--observe", 1e-3, "--method", "ekf", "--out", tmp_path / "p.csv"]
-    assert status(*command, "--conformal", calibration.path) == 0
-    assert "  12 calibration tracks: there are too few samples to tell a velocity" in capsys.readouterr().out
+    assert (
+        "  12 calibration tracks: there are too few samples to tell a velocity"
+        in printed(*command, "--conformal", calibration.path).out
+    )
 
 
 @pytest.mark.parametrize(
@@ -193,9 +181,7 @@ def test_calibration_tracks_that_fail_are_reported(
         ("save", "save_conformal must come with --conformal"),
     ],
 )
-def test_bad_calibration_tracks(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str, message: str
-) -> None:
+def test_bad_calibration_tracks(dataset: Dataset, tmp_path: Path, case: str, message: str) -> None:
     folder, out, kept = tmp_path / "made", tmp_path / "out", tmp_path / "kept.yaml"
     out.mkdir()
     write_simulation(folder, SimulationConfig(tracks=8, rate=60.0, seed=3))
@@ -215,8 +201,7 @@ def test_bad_calibration_tracks(
         "save": ["--save-conformal", out / "scales.yaml"],
     }
     command = ["predict", dataset.path, "--observe", 0.3, "--method", "ekf", "--out", out / "p.csv"]
-    assert status(*command, *options.get(case, ["--conformal", folder])) == 2
-    said = capsys.readouterr()
+    said = printed(*command, *options.get(case, ["--conformal", folder]), status=2)
     lines = [line for line in said.err.splitlines() if not line.endswith("tracks predicted")]  # progress may show
     assert (said.out, len(lines)) == ("", 1)
     assert lines[0].startswith("ballfg: error: ")
@@ -224,22 +209,26 @@ def test_bad_calibration_tracks(
     assert list(out.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("residual", "code", "message"),
+    [
+        (True, 0, "m.yaml learned from a ball with a radius of 0.0335 m; this one has 0.02 m"),
+        (False, 2, "the ball must have the radius 0.0335 m that its networks learned from; got 0.02 m"),
+    ],
+)
 def test_networks_that_learned_from_another_ball_are_a_doubt(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    dataset: Dataset, tmp_path: Path, residual: bool, code: int, message: str
 ) -> None:
     """Those that correct laws; without laws they are refused."""
-    options = ("--observe", 0.3, "--model", tmp_path / "m.yaml", "--out", tmp_path / "p.csv")
     base = nominal_model("tennis")
-    for residual, code in ((True, 0), (False, 2)):
-        small = Architecture.of("mnn+gs", width_flight=2, width_contact=2, depth=1, residual=residual)
-        save_model(build(small, radius=base.radius, base=base if residual else None), tmp_path / "m.yaml")
-        assert status("predict", dataset.path, *options) == code
-    said = "".join(capsys.readouterr())
-    assert "m.yaml learned from a ball with a radius of 0.0335 m; this one has 0.02 m" in said
-    assert "the ball must have the radius 0.0335 m that its networks learned from; got 0.02 m" in said
+    small = Architecture.of("mnn+gs", width_flight=2, width_contact=2, depth=1, residual=residual)
+    save_model(build(small, radius=base.radius, base=base if residual else None), tmp_path / "m.yaml")
+    options = ("--observe", 0.3, "--model", tmp_path / "m.yaml", "--out", tmp_path / "p.csv")
+    said = printed("predict", dataset.path, *options, status=code)
+    assert message in said.out + said.err
 
 
-def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path) -> None:
     model = nominal_model()
     model.spins = SpinPopulation(
         "player", {name: SpinGroup((0.0, spin, 0.0), (5.0,) * 3, 9) for name, spin in {"a": 200.0, "b": -200.0}.items()}
@@ -259,24 +248,18 @@ def test_the_group_of_all_tracks(dataset: Dataset, tmp_path: Path, capsys: pytes
 
     write_dataset(tmp_path / "eve", dataset.info, (replace(track, labels={"player": "eve"}) for track in dataset))
     options = ("--observe", 0.3, "--model", tmp_path / "model.yaml", "--out", tmp_path / "eve.csv")
-    capsys.readouterr()
-    assert status("predict", tmp_path / "eve", *options) == 0
-    said, count = capsys.readouterr().err, len(dataset)
+    said, count = printed("predict", tmp_path / "eve", *options).err, len(dataset)
     assert f"{count} of {count} tracks are of groups (player) that the model does not know, such as 'eve'" in said
 
     def streamed(*options: object) -> str:
-        capsys.readouterr()
-        assert status("live", *options, "--model", tmp_path / "model.yaml", "--speed", 0) == 0
-        return "".join(str(json.loads(line).get("spin")) for line in capsys.readouterr().out.splitlines())
+        lines = printed("live", *options, "--model", tmp_path / "model.yaml", "--speed", 0).out.splitlines()
+        return "".join(str(json.loads(line).get("spin")) for line in lines)
 
     assert len({streamed("--replay", unlabelled, *more) for more in (("--group", "a"), ("--group", "b"), ())}) == 3
-    capsys.readouterr()
     model_file, out = tmp_path / "model.yaml", tmp_path / "none.csv"
     options = ("predict", unlabelled, "--observe", 0.3, "--out", out)
-    assert status(*options, "--model", model_file, "--group", "c") == 2
-    assert "group must be one of the model's, a, b; got 'c'" in capsys.readouterr().err
-    assert status(*options, "--group", "a") == 2
-    assert "group must be None for a model without groups; got 'a'" in capsys.readouterr().err
+    assert "group must be one of the model's, a, b; got 'c'" in refused(*options, "--model", model_file, "--group", "c")
+    assert "group must be None for a model without groups; got 'a'" in refused(*options, "--group", "a")
     assert not out.exists()
 
 
@@ -321,11 +304,12 @@ def test_a_horizon_goes_on_beyond_the_last_stamp(dataset: Dataset, tmp_path: Pat
         (("--apex", "--conformal", "."), "conformal must not be given with events"),
     ],
 )
-def test_events_that_are_none_are_one_line(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], rule: str
-) -> None:
+def test_events_that_are_none_are_one_line(dataset: Dataset, tmp_path: Path, more: tuple[str, ...], rule: str) -> None:
     out = tmp_path / "events.csv"
-    assert status("predict", dataset.path, "--observe", 0.3, *more, "--out", out) == 2
-    said = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    said = [
+        line
+        for line in refused("predict", dataset.path, "--observe", 0.3, *more, "--out", out).splitlines()
+        if "error" in line
+    ]
     assert said[0].startswith(f"ballfg: error: {rule}")
     assert not out.exists()

@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
 from ballfg.vision.camera_file import write_cameras
-from tests.commands import status
+from tests.commands import printed, refused, status
 from tests.estimation.observations.sighted_rig import RIG, TABLE, scene, world
 from tests.pages.made import Fall, Made, make
 from tests.written_tables import write_sightings
@@ -20,11 +20,10 @@ def made(tmp_path: Path) -> Made:
     return make(tmp_path / "made", {"a": Fall(), "b": Fall(0.5)})
 
 
-def test_page_and_picture(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_page_and_picture(made: Made, tmp_path: Path) -> None:
     page, picture = tmp_path / "page.html", tmp_path / "picture.png"
     given = (made.predictions, made.dataset, made.states)
-    assert status("show", *given, "--out", page, "--png", picture, "--track", "b") == 0
-    said = capsys.readouterr()
+    said = printed("show", *given, "--out", page, "--png", picture, "--track", "b")
     assert said.out.splitlines() == [f"{picture}: shot b", f"{page}: 1 of 2 shots"]
     assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -40,39 +39,30 @@ def test_page_and_picture(made: Made, tmp_path: Path, capsys: pytest.CaptureFixt
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(
-    made: Made,
-    tmp_path: Path,
-    words: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    made: Made, tmp_path: Path, words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert status("show", made.dataset, *words) == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note: ")]
+    lines = [line for line in refused("show", made.dataset, *words).splitlines() if not line.startswith("note: ")]
     assert len(lines) == 1
     assert message in lines[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["made"]
 
 
-def test_a_missing_viewer_is_said_before_anything_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_viewer_is_said_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert status("show", tmp_path / "nothing", "--rerun", tmp_path / "log.rrd") == 2
-    assert "pip install 'ballfg[viewer]'" in capsys.readouterr().err
+    assert "pip install 'ballfg[viewer]'" in refused("show", tmp_path / "nothing", "--rerun", tmp_path / "log.rrd")
 
 
-def test_a_recording_holds_every_shot(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_recording_holds_every_shot(made: Made, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    assert status("show", made.dataset, made.states, "--rerun", tmp_path / "log.rrd") == 0
-    assert f"{tmp_path / 'log.rrd'}: 2 shots" in capsys.readouterr().out
+    assert (
+        f"{tmp_path / 'log.rrd'}: 2 shots"
+        in printed("show", made.dataset, made.states, "--rerun", tmp_path / "log.rrd").out
+    )
     assert (tmp_path / "log.rrd").stat().st_size > 1000
 
 
-def test_what_cameras_saw_is_shown_without_a_table_of_tracks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cameras_saw_is_shown_without_a_table_of_tracks(tmp_path: Path) -> None:
     folder = tmp_path / "seen"
     folder.mkdir()
     write_info(folder / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
@@ -80,6 +70,5 @@ def test_what_cameras_saw_is_shown_without_a_table_of_tracks(
     write_sightings(folder / "detections.csv", [("one", scene(0, world(), duration=0.3).sightings)])
     states, page = folder / "states.csv", tmp_path / "page.html"
     assert status("estimate", folder, "--out", states, "--jobs", 1) == 0
-    assert status("show", folder, states, "--out", page) == 0
-    assert "1 of 1 shots" in capsys.readouterr().out
+    assert "1 of 1 shots" in printed("show", folder, states, "--out", page).out
     assert "triangulated from what the cameras saw" in page.read_text(encoding="utf-8")

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import ballfg as bf
-from ballfg.cli.main import run
 from ballfg.tracks import write_dataset
 from ballfg.tracks.info import DatasetInfo
+from tests.commands import printed
 from tests.front.my_shots import written
 
 
@@ -60,17 +60,14 @@ def test_swapped_axes_and_a_wrong_table_are_noted(shots: bf.Dataset) -> None:
 
 
 @pytest.mark.parametrize(("wrong", "said"), [("axes", SWAPPED), ("table", TABLE)])
-def test_the_command_says_so_too(
-    tmp_path: Path, shots: bf.Dataset, capsys: pytest.CaptureFixture[str], wrong: str, said: str
-) -> None:
+def test_the_command_says_so_too(tmp_path: Path, shots: bf.Dataset, wrong: str, said: str) -> None:
     order, height = ([0, 2, 1], 0.76) if wrong == "axes" else ([0, 1, 2], 0.0)
     tracks = [replace(track, positions=track.positions[:, order], labels={}) for track in shots]
     (tmp_path / "data").mkdir()
     write_dataset(tmp_path / "data", replace(shots.info, table_height=height), tracks)
-    with pytest.raises(SystemExit) as stopped:
-        run(["estimate", str(tmp_path / "data"), "--out", str(tmp_path / "states.csv"), "--jobs", "1"])
-    assert stopped.value.code == (3 if wrong == "axes" else 0)  # no ball flies along a table as fast as that
-    assert f"note: track '000': {said}" in capsys.readouterr().err
+    words = ("estimate", tmp_path / "data", "--out", tmp_path / "states.csv", "--jobs", 1)
+    found = printed(*words, status=3 if wrong == "axes" else 0)  # no ball flies along a table as fast as that
+    assert f"note: track '000': {said}" in found.err
 
 
 def test_a_track_that_was_changed_is_refused_by_every_estimator() -> None:
@@ -81,9 +78,7 @@ def test_a_track_that_was_changed_is_refused_by_every_estimator() -> None:
             bf.estimate(changed, method=method)
 
 
-def test_a_model_beside_the_data_is_offered_where_it_is_another(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_beside_the_data_is_offered_where_it_is_another(tmp_path: Path) -> None:
     folder = written(tmp_path / "shots", 1)
     path, model = folder / "model.yaml", bf.nominal_model()
     model.save(path)
@@ -92,10 +87,9 @@ def test_a_model_beside_the_data_is_offered_where_it_is_another(
     model.save(path)
     offer = f"{path} lies beside the tracks and is not used. Give it as the model to use it."
     assert bf.read(folder).notes == [offer]
-    for words, said in (([], True), (["--model", str(path)], False)):
-        with pytest.raises(SystemExit):
-            run(["estimate", str(folder), "--out", str(tmp_path / "states.csv"), "--jobs", "1", *words])
-        assert (f"note: {offer}\n" in capsys.readouterr().err) is said
+    for words, said in (([], True), (["--model", path], False)):
+        found = printed("estimate", folder, "--out", tmp_path / "states.csv", "--jobs", 1, *words)
+        assert (f"note: {offer}\n" in found.err) is said
 
 
 @pytest.mark.parametrize("jobs", [0, -1, 10_001])

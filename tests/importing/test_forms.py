@@ -20,7 +20,7 @@ from ballfg.importing import Choices
 from ballfg.importing.proposal import propose
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track, read_dataset
-from tests.commands import status
+from tests.commands import refused, status
 from tests.importing.throws import write_rows
 
 TABLE = 0.76
@@ -282,10 +282,9 @@ def test_no_option_but_out(form: Form, shots: list[Track], tmp_path: Path) -> No
     assert "--table-height" in page
 
 
-def test_frames_and_a_rate(shots: list[Track], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_and_a_rate(shots: list[Track], tmp_path: Path) -> None:
     source = headers_of_three_lines(tmp_path, shots)
-    assert status("import", source, "--out", tmp_path / "out") == 2
-    assert "fits about 120 Hz. Decide it with --rate 120." in capsys.readouterr().err
+    assert "fits about 120 Hz. Decide it with --rate 120." in refused("import", source, "--out", tmp_path / "out")
     assert status("import", source, "--out", tmp_path / "out", "--rate", 120) == 0
     same_shots(list(read_dataset(tmp_path / "out")), shots, 2e-9)
 

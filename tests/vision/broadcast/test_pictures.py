@@ -16,7 +16,7 @@ from ballfg.vision.broadcast.background import matched
 from ballfg.vision.broadcast.candidates import aligned_candidates, find_candidates
 from ballfg.vision.broadcast.motion import Shot, find_motion
 from ballfg.vision.broadcast.pinhole import Pinhole
-from tests.commands import status
+from tests.commands import printed
 
 SIDE = looking((0.5, -8.0, 3.5), (0.0, 0.0, 0.0), 1000.0)
 RADIUS, LIMITS = 0.02, np.array([3.0, 8.0])  # m; px, diameters of a ball
@@ -113,7 +113,7 @@ def hall() -> list[Image]:
     ids=["black", "turned", "no table", "close-up", "five pictures", "no ball"],
 )
 def test_a_video_without_a_rally_is_refused_in_one_line_and_nothing_is_written(
-    images: Callable[[], Sequence[Image]], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    images: Callable[[], Sequence[Image]], message: str, tmp_path: Path
 ) -> None:
     path, shown = tmp_path / "a.mp4", images()
     size = (shown[0].shape[1], shown[0].shape[0])
@@ -121,8 +121,11 @@ def test_a_video_without_a_rally_is_refused_in_one_line_and_nothing_is_written(
     for image in shown:
         writer.write(image)
     writer.release()
-    assert status("track", path, "--out", tmp_path / "rally") == 2
-    said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith(("note: ", "ballfg track: "))]
+    said = [
+        line
+        for line in printed("track", path, "--out", tmp_path / "rally", status=2).err.splitlines()
+        if not line.startswith(("note: ", "ballfg track: "))
+    ]
     assert len(said) == 1
     assert message in said[0]
     assert [one.name for one in tmp_path.iterdir()] == ["a.mp4"]
