@@ -10,8 +10,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from tests.places import ROOT
+
+
+def fresh(code: str, **more: Any) -> subprocess.CompletedProcess[str]:
+    """What an interpreter of its own prints of some code."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, **more)
+
 
 COMMAND = "ballfg.cli.main:run"
 """`ballfg`, as the name of its function."""

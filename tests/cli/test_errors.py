@@ -10,6 +10,7 @@ import torch
 
 from ballfg.cli.start import BAD_INPUT, NO_MEMORY, guarded
 from tests.commands import printed
+from tests.interpreter import fresh
 from tests.places import ROOT
 
 
@@ -84,20 +85,13 @@ def run():
 def test_closed_streams_lead_nowhere(tmp_path):
     """Not into the next file that is opened."""
     (tmp_path / "program_of_a_test.py").write_text(PROGRAM)
-    subprocess.run([sys.executable, "-c", CLOSED], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+    fresh(CLOSED, cwd=tmp_path, check=True)
     assert (tmp_path / "result").read_text() == "'' False"
 
 
 def test_a_current_folder_that_is_gone_is_one_line(tmp_path):
     code = "import os, sys; os.rmdir(os.getcwd()); from ballfg.cli.entry import ballfg; ballfg()"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = fresh(code, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (
         BAD_INPUT,
         "ballfg: error: the current folder: No such file or directory. Go to one that exists.\n",

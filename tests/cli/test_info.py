@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -17,20 +15,14 @@ from ballfg.cli.commands.info import extras, packages, required
 from ballfg.cli.main import app
 from ballfg.cli.start import _command
 from tests.commands import printed, refused
-from tests.interpreter import Interpreter
-from tests.places import DOCS, ROOT
+from tests.interpreter import Interpreter, fresh
+from tests.places import DOCS
 
 GUIDE = (DOCS / "add_an_effect.md").read_text(encoding="utf-8")
 HEAVY = ("torch", "gtsam", "cv2", "scipy", "matplotlib")
 LIGHTER = ("numpy", "pyarrow", "cloudpickle")
 SPY = f"import atexit, sys\natexit.register(lambda: print(set({HEAVY}) & set(sys.modules)))\n"
 """Prints at the end which heavy modules were imported."""
-
-
-def run(code: str) -> subprocess.CompletedProcess[str]:
-    """A fresh interpreter."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
 
 
 def command(*arguments: str) -> str:
@@ -59,7 +51,7 @@ def charged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interpreter]:
 
 
 def test_version() -> None:
-    assert run(command("--version")).stdout == f"ballfg {version('ballfg')}\n"
+    assert fresh(command("--version")).stdout == f"ballfg {version('ballfg')}\n"
 
 
 def test_info_lists_packages_machine_and_what_is_registered(charged: Interpreter) -> None:
@@ -97,7 +89,7 @@ def test_commands_use_effects_of_an_installed_package(charged: Interpreter, tmp_
     [("--help",), ("--version",), *((name, "--help") for name in ("estimate", "predict", "simulate"))],
 )
 def test_help_imports_nothing_heavy(arguments: tuple[str, ...]) -> None:
-    done = run(SPY.replace(str(HEAVY), str(HEAVY + LIGHTER)) + command(*arguments))
+    done = fresh(SPY.replace(str(HEAVY), str(HEAVY + LIGHTER)) + command(*arguments))
     assert done.stdout.endswith("\nset()\n"), done.stderr
 
 
@@ -113,7 +105,7 @@ def test_without_a_word_there_is_help() -> None:
 @pytest.mark.parametrize("name", ["estimate", "predict", "diagnose"])
 def test_a_mistyped_path_is_refused_before_anything_heavy_is_imported(name: str, tmp_path: Path) -> None:
     code = command(name, "/no/such/folder", "--out", str(tmp_path / "out.csv"))
-    done = run(SPY + code)
+    done = fresh(SPY + code)
     assert done.returncode == 2
     assert done.stdout == "set()\n"
     assert done.stderr == (

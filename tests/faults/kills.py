@@ -15,7 +15,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,7 +40,7 @@ class Scenario:
         again: the command that is typed after a kill; None: the same.
         refused: words of a refusal that is right where the new result stands already; the command has no --force.
         steps: the command leaves whole steps in between, so that a folder need be neither old nor new.
-        varying: names of files whose bytes differ from run to run, because they hold times.
+        varying: files whose bytes differ from run to run, because they hold times.
         companions: names of files that tell of the result; they may be missing, and never tell of another one.
     """
 
@@ -113,18 +113,14 @@ def _in_child(work: Callable[[], object], said: Path) -> None:
         os._exit(status)
 
 
-def state(folder: Path, scenario: Scenario) -> State:
-    """Digests of all files but hidden ones, which are being made."""
+def state(folder: Path, varying: Collection[str] = ()) -> State:
+    """Digests of all files but hidden ones, which are being made; `any` for those that differ from run to run."""
     files = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return {
-        str(name): "any" if path.name in scenario.varying else _digest(path)
+        str(name): "any" if str(name) in varying else hashlib.sha256(path.read_bytes()).hexdigest()
         for name, path in files.items()
         if not any(part.startswith(".") for part in name.parts) and "tfevents" not in path.name
     }
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def run(scenario: Scenario, tally: Tally, most: int | None, error: int = KILL, lasting: bool = False) -> None:
@@ -141,11 +137,11 @@ def run(scenario: Scenario, tally: Tally, most: int | None, error: int = KILL, l
         _warm(scenario, folder)
         shutil.rmtree(folder)
         shutil.copytree(pristine, folder)
-        old = state(folder, scenario)
+        old = state(folder, scenario.varying)
         calls = Path(place, "calls")
         status = in_fork(lambda: _counted(scenario, folder, calls), said)
         assert status == 0, f"{scenario.name}: {said.read_text()}"
-        new = state(folder, scenario)
+        new = state(folder, scenario.varying)
         count = len(calls.read_text().splitlines())
         numbers = range(1, count + 1) if most is None else _spread(count, most)
         for number in numbers:
@@ -185,7 +181,7 @@ def _judge(scenario: Scenario, folder: Path, said: Path, old: State, new: State,
     status = in_fork(lambda: scenario.read(folder), said)
     if status not in (0, 2) or (status == 2 and len(said.read_text().splitlines()) != 1):
         tally.add("reader fails", f"{where}: {said.read_text()[-300:]}")
-    found = state(folder, scenario)
+    found = state(folder, scenario.varying)
     whole = set(old.items()) | set(new.items())
     half = [name for name, digest in found.items() if (name, digest) not in whole]
     if not scenario.steps:
@@ -199,8 +195,8 @@ def _judge(scenario: Scenario, folder: Path, said: Path, old: State, new: State,
     right = bool(scenario.refused) and status == 2 and scenario.refused in said.read_text() and found == new
     if status != 0 and not right:
         tally.add("refused restarts", f"{where}: {said.read_text()[-300:]}")
-    elif state(folder, scenario) != new:
-        differing = sorted(set(state(folder, scenario).items()) ^ set(new.items()))[:4]
+    elif state(folder, scenario.varying) != new:
+        differing = sorted(set(state(folder, scenario.varying).items()) ^ set(new.items()))[:4]
         tally.add("other results", f"{where}: {differing}")
     left = [str(path.relative_to(folder)) for path in folder.rglob("*") if path.name.startswith(".")]
     if left:

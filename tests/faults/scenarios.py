@@ -286,7 +286,7 @@ SCENARIOS = (
         train,
         lambda folder: read_checkpoint(folder / "run"),
         steps=True,
-        varying=("metrics.csv", "training.html", "curves.png"),
+        varying=("run/metrics.csv", "run/training.html", "run/curves.png"),
     ),
 )
 

@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.machine import DATE
-from tests.faults.kills import State, Tally, _digest
+from tests.faults.kills import State, Tally, state
 from tests.places import ROOT
 
 PATIENCE: Final = 5.0
@@ -120,16 +120,6 @@ def copied(pristine: Path, place: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(pristine, folder)
     return folder
-
-
-def state(folder: Path, varying: frozenset[str] = frozenset()) -> State:
-    """Digests of all files that have their name; `any` for those that differ from run to run."""
-    files = {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
-    return {
-        name: "any" if name in varying else _digest(path)
-        for name, path in files.items()
-        if not any(part.startswith(".") for part in Path(name).parts) and "tfevents" not in name
-    }
 
 
 def alive(trial: str) -> list[int]:

@@ -105,15 +105,8 @@ def test_a_pipe_in_place_of_a_file_is_not_waited_for(home: Path, name: str) -> N
 def test_links_in_a_loop_are_refused_in_one_line(home: Path) -> None:
     for name in ("detections.csv", "cameras.yaml"):
         (home / "d" / name).symlink_to(name)
-    words = [
-        "track",
-        home / "d" / "detections.csv",
-        "--cameras",
-        home / "d" / "cameras.yaml",
-        "--out",
-        home / "tracked",
-    ]
-    found, said = in_this_process(list(map(str, words)))
+    seen, cameras = (str(home / "d" / name) for name in ("detections.csv", "cameras.yaml"))
+    found, said = in_this_process(["track", seen, "--cameras", cameras, "--out", str(home / "tracked")])
     assert (found, said.count("\n")) == (2, 1), said
     assert "Too many levels of symbolic links" in said
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +13,7 @@ from ballfg.estimation import dataset_settings
 from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.simulation import tennis
 from tests.front.my_shots import same, written
+from tests.interpreter import fresh
 
 
 def test_a_track_of_a_dataset_brings_ball_table_and_noise(shots: bf.Dataset, track: bf.Track) -> None:
@@ -114,7 +113,6 @@ def test_a_ball_stands_for_its_nominal_model(track: bf.Track) -> None:
 
 def test_the_door_itself_is_light() -> None:
     code = "import sys, ballfg as bf; bf.__version__; dir(bf); print({'torch', 'gtsam', 'numpy'} & sys.modules.keys())"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout == "set()\n"
+    assert fresh(code).stdout == "set()\n"
     for name in ("read", "estimate", "predict", "diagnose", "Online", "BallState", "RadarSpeed", "SpinReading"):
         assert name in dir(bf)

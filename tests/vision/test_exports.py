@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from tests.interpreter import fresh
 
 
 def test_detection_does_without_torch() -> None:
     code = "import sys, ballfg.vision.detection.detect; print('torch' in sys.modules, 'matplotlib' in sys.modules)"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout.split() == ["False", "False"]
+    assert fresh(code).stdout.split() == ["False", "False"]
