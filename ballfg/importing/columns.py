@@ -1,6 +1,6 @@
 """Determines the role of each column by its name or else by its numbers."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -82,6 +82,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     time_unit = "ns" if len(time) == 2 else None
     if len(time) == 1:
         time_unit = next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
+    stated = [next((m.unit for m in read.get(name, []) if m.unit), None) for name in sigmas or ()]
     used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
     trajectory, identities = identified(table, trajectory, time or tuple(filter(None, [frame])), used)
     used.update(identities, [trajectory or ""])
@@ -97,13 +98,8 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         by_name,
         tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
         identities,
-        tuple(own if own in LENGTHS and own != units else None for own in _units(read, sigmas or ())),
+        tuple(own if own in LENGTHS and own != units else None for own in stated),
     )
-
-
-def _units(read: Mapping[str, list[Meaning]], names: Iterable[str]) -> Iterator[str | None]:
-    """The unit in each name."""
-    return (next((meaning.unit for meaning in read.get(name, []) if meaning.unit), None) for name in names)
 
 
 def _existing(table: RawTable, name: str) -> str:

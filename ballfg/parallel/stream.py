@@ -67,12 +67,13 @@ def _here(function: Callable[[Sequence[T]], Iterable[R]], chunk: Sequence[T]) ->
 
 def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> Iterator[tuple[int, R]]:
     """The number and the result of each item, as they finish; this process waits. Raises: the function's exceptions."""
-    send = executor.sender(partial(_of_one, function))
+    send = executor.sender(partial(each, function))
     pending = {number: send([item]) for number, item in enumerate(items)}
     try:
         while pending:
             for number in [number for number, one in pending.items() if one.done()]:
-                yield number, pending.pop(number).result()
+                (result,) = pending.pop(number).result()
+                yield number, result
             time.sleep(LOOK)
     except KeyboardInterrupt:
         executor.stop()
@@ -85,8 +86,3 @@ def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor)
 def shared(function: Callable[[T], R], items: Iterable[T], executor: Executor) -> list[R]:
     """The results of items in order; this process computes some of them too. Raises: the function's exceptions."""
     return list(in_order(partial(each, function), ([item] for item in items), executor))
-
-
-def _of_one(function: Callable[[T], R], chunk: Sequence[T]) -> R:
-    (item,) = chunk
-    return function(item)

@@ -79,6 +79,7 @@ def live(
     Example: ballfg live --replay data/aimy --plane x=2.0 --out states.jsonl
     """
     from ballfg.checks import check_number, check_range
+    from ballfg.files.whole_file import check_file
     from ballfg.live.session import Session, Wanted, warm_up
     from ballfg.live.sources.source import Inbox
     from ballfg.live.tracker import Tracker
@@ -93,7 +94,11 @@ def live(
     if replay is not None and listen is not None:
         raise ValueError(f"listen must stand alone; got it with --replay {replay}. Leave one of them out.")
     if out is not None:
-        _check_out(out)
+        check_file(out)
+        if out.suffix == SQLITE:
+            raise ValueError(
+                f"out must be JSON lines or a bag in MCAP; got {out}. Let its name end in .jsonl or .mcap."
+            )
     inputs.know_effects(effects_file)
     inputs.know_observations(observations_file)
     bag = replay is not None and (replay.suffix in (MCAP, SQLITE) or (replay / "metadata.yaml").is_file())
@@ -113,15 +118,6 @@ def live(
             _run(session, inbox)
     for line in session.summary():
         print(f"ballfg live: {line}", file=sys.stderr)
-
-
-def _check_out(out: Path) -> None:
-    """Refuses an unusable recording before any work. Raises: ValueError; FileNotFoundError: no such folder."""
-    from ballfg.files.whole_file import check_file
-
-    check_file(out)
-    if out.suffix == SQLITE:
-        raise ValueError(f"out must be JSON lines or a bag in MCAP; got {out}. Let its name end in .jsonl or .mcap.")
 
 
 def _dataset(folder: Path | None) -> "Dataset | None":

@@ -112,11 +112,10 @@ def predict(
         count = len(opened.dataset)
         estimator = opened.estimator(method, solver, group)
         scales = None
-        if conformal is not None and opened.dataset.rough:
-            raise ValueError(
-                "conformal must not be given with detections: its scales are those of positions. Leave it out."
-            )
         if conformal is not None:
+            if opened.dataset.rough:
+                what = "conformal must not be given with detections: its scales are those of positions"
+                raise ValueError(f"{what}. Leave it out.")
             scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
         if asked:
             _write_events(table, estimator, opened.dataset, observe, asked, ahead or EVENTS_WITHIN, workers, outcome)

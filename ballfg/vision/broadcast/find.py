@@ -176,8 +176,10 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
             seen = np.roll(quad[::-1], first, axis=0)
             plane = cv2.getPerspectiveTransform(flat, (seen - middle).astype(np.float32))
             one = _first(np.asarray(plane, dtype=np.float64), seen - middle, court, size)
-            if one is not None and _missed(one := _fitted(one, court, seen), court, seen) < MISSED * scale:
-                found.append(one)
+            if one is not None:
+                one = _fitted(one, court, seen)
+                missed = np.linalg.norm(one.project(court.corners) - seen, axis=1)
+                found += [one] if (missed < MISSED * scale).all() else []  # NaN: one is behind the camera
     return [_in_front(one) for one in found if _possible(*_views(one, court), court).all()]
 
 
@@ -185,11 +187,6 @@ def _views(camera: Pinhole, court: Court) -> tuple[Array, Array, Array]:
     """Turn, place, and the court's corners in the camera's frame, (1, ...) each."""
     at = (court.corners - camera.place) @ camera.turn.T
     return camera.turn[None], camera.place[None], at[None]
-
-
-def _missed(camera: Pinhole, court: Court, seen: Array) -> float:
-    """The px by which a camera misses corners that are seen (4, 2) px; infinite if one is behind it."""
-    return float(np.nan_to_num(np.linalg.norm(camera.project(court.corners) - seen, axis=1), nan=np.inf).max())
 
 
 def _fitted(camera: Pinhole, court: Court, seen: Array) -> Pinhole:

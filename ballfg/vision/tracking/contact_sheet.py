@@ -90,15 +90,15 @@ class ContactSheet:
         self._tracking, self._table = tracking, table
         self._shown = _spread(len(tracking.balls), MOST_TRACKS).tolist()
         self._views: list[list[View]] = []
-        cameras = list(enumerate(tracking.cameras[:MOST_VIEWS]))
+        cameras = tracking.cameras[:MOST_VIEWS]
         for track in self._shown:
-            seen = [tracking.seen(tracking.balls[track], camera) for camera, _ in cameras]
+            seen = [tracking.seen(tracking.balls[track], camera) for camera in range(len(cameras))]
             pairs = zip(seen, cameras, strict=True)
-            self._views.append([View(one.frames, one.pixels, model.size) for one, (_, model) in pairs])
+            self._views.append([View(one.frames, one.pixels, model.size) for one, model in pairs])
         if not self._shown:
-            frames = [np.arange(len(tracking.detections[camera].frames)) for camera, _ in cameras]
-            pairs_of_all = zip(frames, cameras, strict=True)
-            self._views.append([View(numbers, np.zeros((0, 2)), model.size) for numbers, (_, model) in pairs_of_all])
+            counts = [len(found.frames) for found in tracking.detections]
+            sizes = [model.size for model in cameras]
+            self._views.append([View(np.arange(n), np.zeros((0, 2)), s) for n, s in zip(counts, sizes, strict=False)])
 
     def passing(self, camera: int, stream: Iterable[tuple[float, Image]]) -> Iterator[tuple[float, Image]]:
         """Passes the frames of a camera on, and keeps of them what the sheet needs."""
