@@ -78,7 +78,7 @@ class Sightings:
             ("streaks", (m, 2), "Give 0 for unknown"),
             ("shifts", (m, 3), "Give 0 for none"),
         ):
-            if getattr(self, field) is None:
+            if field in ("streaks", "shifts") and getattr(self, field) is None:
                 continue
             array = check_array(field, getattr(self, field), shape, "Pass one row per sighting.")
             if not np.isfinite(array).all():
