@@ -3,8 +3,8 @@
 The scatter from sample to sample does not tell how uncertain a forecast 0.3 s ahead is. So noise is scored by its
 forecasts: from many origins in every track a Kalman filter forecasts 20 to 300 ms ahead, and the score is the mean
 negative logarithm of the density at the later samples (A. P. Dawid, "The prequential approach", 1984), with tails that
-grow linearly. The same score of the next sample alone, the marginal likelihood, is added with a small weight: it
-separates parts of the noise that forecasts leave undetermined.
+grow linearly. The mean of the same for each next sample, the marginal likelihood, is added: it separates parts of the
+noise that forecasts leave undetermined.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,6 @@ START_EVERY: Final = 0.05
 """s between two forecast origins in a track."""
 EARLIEST_START: Final = 0.2
 """s after the first sample. Before that the start of the track dominates, and no robot acts on it yet."""
-MARGINAL_WEIGHT: Final = 0.1
 TAIL: Final = 3.0
 """Standard deviations of a coordinate beyond which its score grows linearly, so that a missed hit does not dominate."""
 NINETY: Final = 1.6448536269514722
@@ -93,7 +92,7 @@ class Forecaster:
         measured = self.filter.measured(noise)
         filtered = self.filter.run(noise, measured)
         total, inside, count = self._forecast(filtered, noise, measured)
-        by_track = total / max(count, 1) + MARGINAL_WEIGHT * filtered.nll / max(filtered.count, 1)
+        by_track = total / max(count, 1) + filtered.nll / max(filtered.count, 1)
         return Score(by_track, inside / max(3 * count, 1), len(self.starts))
 
     def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
