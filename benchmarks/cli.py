@@ -161,8 +161,7 @@ def cameras(run: Run, data: Data = None, view: Views = None) -> None:
 
     Example: ballfg-bench cameras --out results/cameras
     """
-    from ballfg.benchmarks.cameras.one_view import run_views
-    from ballfg.benchmarks.cameras.phones import run_phones
+    from ballfg.benchmarks.cameras.one_view import run_phones, run_views
     from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
     from ballfg.estimation import read_sighted
 

@@ -12,8 +12,7 @@ from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, analytic, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stamps import Stamps
-from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest
-from ballfg.diagnosis.label_verdicts import LabelCheck
+from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest, LabelCheck
 from ballfg.diagnosis.report.wording import sentence
 from ballfg.diagnosis.residual_tests.counted_stamps import (
     noise_of_all_frames,
@@ -21,15 +20,13 @@ from ballfg.diagnosis.residual_tests.counted_stamps import (
     with_all_frames,
     with_errors_of_counting,
 )
-from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
-from ballfg.diagnosis.residual_tests.predicted import predicted_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.sparse import fallback
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
-from ballfg.diagnosis.search.plausible import at_bound, implausible
 from ballfg.diagnosis.search.process_noise import (
     calibrated_model,
     errors_of,
@@ -39,6 +36,7 @@ from ballfg.diagnosis.search.process_noise import (
     predictive_model,
     unpopulated_model,
 )
+from ballfg.diagnosis.search.ranking import at_bound, implausible
 from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.domain import Domain

@@ -22,13 +22,12 @@ from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.patterns import DRIFT
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
+from ballfg.diagnosis.generic_test import LabelCheck
 from ballfg.diagnosis.hypotheses.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
-from ballfg.diagnosis.label_verdicts import LabelCheck
 from ballfg.diagnosis.report.wording import joined as listed, sentence
-from ballfg.diagnosis.residual_tests.generic import generic_tests
+from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
-from ballfg.diagnosis.residual_tests.predicted import predicted_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.loop import NAMED, SearchLoop

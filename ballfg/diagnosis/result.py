@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.budget import ErrorBudget
-from ballfg.diagnosis.generic_test import GenericTest
-from ballfg.diagnosis.label_verdicts import LabelCheck
+from ballfg.diagnosis.generic_test import GenericTest, LabelCheck
 from ballfg.dynamics import BallModel
 
 if TYPE_CHECKING:

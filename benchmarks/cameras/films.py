@@ -15,8 +15,20 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.cameras.hall import PLAIN, SIZE, Colour, Look, hall, looking, panned, picture
-from ballfg.benchmarks.cameras.looks import SHIRTS, SIZES, drawn_look, judges
+from ballfg.benchmarks.cameras.hall import (
+    PLAIN,
+    SHIRTS,
+    SIZE,
+    SIZES,
+    Colour,
+    Look,
+    drawn_look,
+    hall,
+    judges,
+    looking,
+    panned,
+    picture,
+)
 from ballfg.benchmarks.cameras.strokes import STEP, TABLE, Scattered, drawn_ball, scattered
 from ballfg.dynamics import AnalyticModel
 from ballfg.state import POSITION, VZ

@@ -20,8 +20,7 @@ from ballfg.dynamics import load_model
 from ballfg.estimation.configure import launcher_of, learned_process
 from ballfg.files.whole_file import write_text
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.run.metrics import read_metrics
-from ballfg.learning.run.run_folder import METRICS, MODEL
+from ballfg.learning.run.run_folder import METRICS, MODEL, read_metrics
 from ballfg.learning.run.training import run_training
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.learning.sequence.trainee import FOLDER

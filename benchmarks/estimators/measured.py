@@ -8,7 +8,7 @@ from itertools import islice, pairwise
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.estimators.scoring import LEVELS, sums_and_counts
+from ballfg.benchmarks.estimators.protocols import LEVELS, sums_and_counts
 from ballfg.benchmarks.metrics import Figure, Statistic, bootstrap, inside, pooled_mean, quantile, root_mean_square
 from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.dynamics import BallModel, nominal_model

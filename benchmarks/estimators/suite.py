@@ -9,8 +9,17 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, run_measured
-from ballfg.benchmarks.estimators.protocols import fair_protocol, paper_protocol
-from ballfg.benchmarks.estimators.scoring import LEVELS, Scores, TrackScore, covered, every, pooled, score_tracks
+from ballfg.benchmarks.estimators.protocols import (
+    LEVELS,
+    Scores,
+    TrackScore,
+    covered,
+    every,
+    fair_protocol,
+    paper_protocol,
+    pooled,
+    score_tracks,
+)
 from ballfg.benchmarks.gaussian_settings import StepNoise
 from ballfg.benchmarks.metrics import Figure, Statistic, bootstrap, chi_square_band, pooled_mean, pooled_rms, ratio
 from ballfg.benchmarks.results import CURVE_MARK, Results

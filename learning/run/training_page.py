@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ballfg.arrays import Array
-from ballfg.learning.run.metrics import Epoch
+from ballfg.learning.run.run_folder import Epoch
 from ballfg.learning.trainee import Learned, PredictedShot
 from ballfg.pages import html
 

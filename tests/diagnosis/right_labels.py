@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from ballfg.diagnosis import check_labels, diagnose, fit_model, hold_out
-from ballfg.diagnosis.label_verdicts import LabelCheck
+from ballfg.diagnosis.generic_test import LabelCheck
 from ballfg.diagnosis.search.process_noise import calibrated_model
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas

@@ -10,7 +10,7 @@ import yaml
 from safetensors.torch import load_file
 
 from ballfg.learning import read_config
-from ballfg.learning.run.metrics import read_metrics
+from ballfg.learning.run.run_folder import read_metrics
 from ballfg.learning.trainee import TRAINEES
 from ballfg.simulation import SimulationConfig, write_simulation
 from tests.learning.estimates import directional

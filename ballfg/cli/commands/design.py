@@ -73,7 +73,7 @@ def design(
     for name, value in (("cameras", cameras), ("noise", noise)):
         if value is not None:
             raise ValueError(f"--{name} is for --stand. Leave it out.")
-    from ballfg.diagnosis.design.levels import parse_levels
+    from ballfg.diagnosis.design.choice import parse_levels
     from ballfg.diagnosis.design.plan import check_labels, design_shots
     from ballfg.dynamics import AnalyticModel
     from ballfg.tracks import TableWriter
@@ -126,7 +126,7 @@ def _stand(
 ) -> None:
     """Prints how well a camera would know the strokes of a dataset from each place. Raises: ValueError: options."""
     from ballfg.checks import check_number
-    from ballfg.diagnosis.design.levels import combinations, parse_levels
+    from ballfg.diagnosis.design.choice import combinations, parse_levels
     from ballfg.diagnosis.design.stand import NOISE, where_to_stand
     from ballfg.tracks import TableWriter
     from ballfg.vision.camera_file import read_cameras

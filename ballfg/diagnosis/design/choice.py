@@ -1,4 +1,4 @@
-"""Chooses the shots that together determine the wanted coefficients best.
+"""Chooses the shots that together determine the wanted coefficients best, among all combinations of given levels.
 
 The measure of a side of r strengths is log det C / 2 r, with C their covariance when all else is unknown: the log of
 its error bar, averaged over its directions. That is D_s-optimality, and c-optimality for a single coefficient. The
@@ -6,7 +6,9 @@ measures of all sides are averaged. Shots are chosen greedily, then exchanged on
 then sorted by their gain.
 """
 
-from collections.abc import Callable, Sequence
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,3 +117,51 @@ def _as_random(known: Array, mean: Array, measure: Measure, reached: float) -> f
         middle = 0.5 * (low + high)
         low, high = (middle, high) if too_few(middle) else (low, middle)
     return high
+
+
+MOST = 5000  # Largest number of combinations. More take minutes, and neighbours hardly differ
+
+
+def parse_levels(text: str, what: str = "candidates") -> dict[str, list[float]]:
+    """Rising levels by setting, of a text such as `topspin=-3..5,wheel=1200..2000:200,speed=9`.
+
+    Args: what: name of the text in messages.
+
+    Raises: ValueError: a text of another form, a repeated setting, a step that is not positive, or too many
+        combinations.
+    """
+    found: dict[str, list[float]] = {}
+    for part in text.split(","):
+        name, _, span = part.partition("=")
+        name = name.strip()
+        if name in found:
+            raise ValueError(f"{what} must name each setting once; got '{name}' twice. Remove one.")
+        found[name] = _levels(name, span, part.strip(), what)
+    count = math.prod(len(levels) for levels in found.values())
+    if count > MOST:
+        raise ValueError(
+            f"{what} must be at most {MOST} combinations; got {count}. Use larger steps: NAME=FROM..TO:STEP."
+        )
+    return found
+
+
+def _levels(name: str, span: str, part: str, what: str) -> list[float]:
+    ends, _, width = span.partition(":")
+    low, dots, high = ends.partition("..")
+    try:
+        first, last, step = float(low), float(high if dots else low), float(width) if width else 1.0
+    except ValueError:
+        first = last = step = math.nan
+    if not name or not (math.isfinite(first) and math.isfinite(last) and first <= last and 0.0 < step < math.inf):
+        raise ValueError(
+            f"{what} must read NAME=LEVEL, NAME=FROM..TO or NAME=FROM..TO:STEP, separated by commas; got '{part}'. "
+            "Write for instance topspin=-3..5,sidespin=-5..5,speed=8..14 or x=-4..4:2."
+        )
+    if (last - first) / step >= MOST:
+        raise ValueError(f"{what} must be at most {MOST} combinations; {name} alone has more. Use a larger step.")
+    return [first + step * k for k in range(math.floor((last - first) / step + 1e-9) + 1)]
+
+
+def combinations(levels: Mapping[str, Sequence[float]]) -> Array:
+    """(m, s) every combination of the levels of s settings, the last setting changing fastest."""
+    return np.array(list(itertools.product(*levels.values())), dtype=np.float64)

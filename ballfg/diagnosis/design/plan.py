@@ -11,10 +11,9 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import did_you_mean
-from ballfg.diagnosis.design.choice import choose
+from ballfg.diagnosis.design.choice import choose, combinations
 from ballfg.diagnosis.design.goal import separating, shrinking
 from ballfg.diagnosis.design.information import information_of
-from ballfg.diagnosis.design.levels import combinations
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, launch_axes
 from ballfg.diagnosis.search.evaluation import on_all, on_others

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import special
 
-from ballfg.diagnosis.evidence.nameless import NAMELESS
+from ballfg.diagnosis.evidence.rows import NAMELESS
 from ballfg.diagnosis.evidence.weighed import Weighed, Weight
 
 ALIKE = 0.05

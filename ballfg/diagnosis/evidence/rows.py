@@ -1,12 +1,15 @@
-"""Rows of a fit, with columns for the motion that its model cannot explain.
+"""Rows of a fit, with columns for the motion that its model cannot explain, and for patterns that no effect describes.
 
 A fit is deterministic: whatever the model lacks is in its residual. Here the same linearised rows get random columns
 beside the first states: white acceleration in short bins of flight, kicks of velocity and spin after contacts, and
 coefficients that scatter from track to track. Their sizes are the noise of the model.
+
+Under wrong physics the nearest effect explains a part, on both halves of the tracks. It is believed only if it explains
+more than smooth patterns of place, velocity, spin and time would, whose sizes are as free as its own.
 """
 
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -15,6 +18,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
+from ballfg.diagnosis.fit.patterns import blocks_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import of_similar_length
 from ballfg.state import SPIN, STATE_DIM
@@ -202,3 +206,40 @@ def random_motion(fit: Fit, scattering: Collection[str] | None = None) -> Motion
             kinds[place, count : count + columns.shape[1]] = np.concatenate([k for _, k in own[row]])
         found.append((random, kinds))
     return Motion(*zip(*found, strict=True))
+
+
+NAMELESS: Final = "something nameless"
+USUAL: Final = 0.125
+"""Usual strength of a pattern, in the unit of its column, which is large: widths of its prior reach twice that."""
+
+
+@dataclass(frozen=True)
+class Patterns:
+    """Columns of all patterns at a fit.
+
+    Attributes:
+        columns: (b, m, p) whitened responses of the samples to patterns that are large in practice, batch by batch.
+        blocks: where in p the columns of each block are; those of a block share the width of their prior.
+    """
+
+    columns: tuple[Array, ...]
+    blocks: tuple[Index, ...]
+
+    @classmethod
+    def of(cls, fit: Fit) -> "Patterns":
+        """The patterns that a fit's flights, contacts and positions may have."""
+        blocks = blocks_of(fit)
+        ends = np.cumsum([block.columns.shape[-1] for block in blocks])
+        places = tuple(np.arange(end - b.columns.shape[-1], end) for b, end in zip(blocks, ends, strict=True))
+        columns = np.concatenate([block.columns for block in blocks], axis=-1) / roots(fit)
+        return cls(tuple(batch.of(columns) for batch in batches_of(fit.problem.stretches.used.numpy())), places)
+
+    def beside(self, rows: Sequence[Rows]) -> list[Rows]:
+        """Rows with the patterns as further common unknowns, last."""
+        return [batch.beside(columns) for batch, columns in zip(rows, self.columns, strict=True)]
+
+
+def rows_beside(fit: Fit, motion: Motion, patterns: Patterns | None) -> list[Rows]:
+    """The rows of a fit as of `rows_of`, with patterns as further common unknowns if there are some."""
+    rows = rows_of(fit, motion)
+    return rows if patterns is None else patterns.beside(rows)

@@ -15,11 +15,9 @@ from scipy import special
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.evidence.condensed import Condensed
 from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, posterior
-from ballfg.diagnosis.evidence.nameless import Patterns, rows_beside
 from ballfg.diagnosis.evidence.odds import tempered
-from ballfg.diagnosis.evidence.prior import WIDTHS, centres, choice_odds, log_odds, scales, within
-from ballfg.diagnosis.evidence.priors_of_fit import Priors
-from ballfg.diagnosis.evidence.rows import Motion, batches_of, roots
+from ballfg.diagnosis.evidence.prior import WIDTHS, Priors, centres, choice_odds, log_odds, scales, within
+from ballfg.diagnosis.evidence.rows import Motion, Patterns, batches_of, roots, rows_beside
 from ballfg.diagnosis.evidence.weighed import Strengths, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 

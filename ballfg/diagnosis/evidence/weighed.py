@@ -10,10 +10,8 @@ from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.ahead import DAMPED, FIRST_DAMPING, HARDLY, Ahead, next_damping
 from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
-from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns, rows_beside
-from ballfg.diagnosis.evidence.prior import WIDTHS, choice_odds, log_odds, within
-from ballfg.diagnosis.evidence.priors_of_fit import Priors
-from ballfg.diagnosis.evidence.rows import Motion, Rows, random_motion
+from ballfg.diagnosis.evidence.prior import WIDTHS, Priors, choice_odds, log_odds, within
+from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, Rows, random_motion, rows_beside
 from ballfg.diagnosis.evidence.sizes import Start, settled
 from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit

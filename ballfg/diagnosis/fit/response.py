@@ -18,10 +18,9 @@ from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
-from ballfg.diagnosis.fit.moved_shot import shoot_compiled
 from ballfg.diagnosis.fit.sensitivity import coefficients_of, with_values
 from ballfg.diagnosis.fit.shooting import LEAST_ARC, Arc, Trajectories, shoot
-from ballfg.diagnosis.fit.tangents import RepeatedMotion
+from ballfg.diagnosis.fit.tangents import RepeatedMotion, shoot_compiled
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.state import STATE_DIM, VELOCITY

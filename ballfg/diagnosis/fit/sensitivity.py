@@ -15,10 +15,9 @@ from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
-from ballfg.diagnosis.fit.moved_shot import Coefficients, shoot_compiled
 from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.fit.stretches import Stretches, of_similar_length
-from ballfg.diagnosis.fit.tangents import MovedArc, RepeatedMotion
+from ballfg.diagnosis.fit.tangents import Coefficients, MovedArc, RepeatedMotion, shoot_compiled
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
 from ballfg.dynamics.model import substitute

@@ -15,9 +15,8 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.odds import Odds
 from ballfg.diagnosis.evidence.prior import centres, scales
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, hypotheses
-from ballfg.diagnosis.one_view.noise import with_likeliest_noise
 from ballfg.diagnosis.one_view.picture import ERRORS, NAMES
-from ballfg.diagnosis.one_view.strokes import Laws, Stroke, all_estimated, scores_again
+from ballfg.diagnosis.one_view.strokes import Laws, Stroke, all_estimated, scores_again, with_likeliest_noise
 from ballfg.diagnosis.one_view.weights import Set, Weights, mean_of, odds_of, slopes_of
 from ballfg.dynamics import AnalyticModel, Surfaces
 from ballfg.dynamics.effect import Effect, Scene, Vector

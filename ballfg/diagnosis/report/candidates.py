@@ -4,9 +4,18 @@ import math
 from collections.abc import Iterator, Sequence
 
 from ballfg.diagnosis.report import pictures
-from ballfg.diagnosis.report.glossary import OUTCOMES, term
 from ballfg.diagnosis.report.headline import not_shown
-from ballfg.diagnosis.report.wording import NONE, capital, listed, number, plain_name, probability, sized
+from ballfg.diagnosis.report.wording import (
+    NONE,
+    OUTCOMES,
+    capital,
+    listed,
+    number,
+    plain_name,
+    probability,
+    sized,
+    term,
+)
 from ballfg.diagnosis.result import Candidate, Diagnosis, Outcome
 from ballfg.dynamics import EFFECTS
 from ballfg.pages.html import Html, bar, explained, picture, section, table, tag

@@ -5,14 +5,13 @@ from collections.abc import Iterator, Mapping
 
 from matplotlib.figure import Figure
 
-from ballfg.diagnosis.generic_test import ALARM
-from ballfg.diagnosis.label_verdicts import percent
+from ballfg.diagnosis.generic_test import ALARM, percent
 from ballfg.diagnosis.report import pictures, wording
 from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
-from ballfg.diagnosis.report.glossary import glossary, term
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin, packages
 from ballfg.diagnosis.report.predictions import errors, one_shot, parts_of_error
+from ballfg.diagnosis.report.wording import glossary, term
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.machine import date

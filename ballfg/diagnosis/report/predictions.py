@@ -5,9 +5,8 @@ from typing import Final
 
 from ballfg.diagnosis.budget import EXPECTED, PARTS
 from ballfg.diagnosis.report import pictures, shots
-from ballfg.diagnosis.report.glossary import term
 from ballfg.diagnosis.report.headline import of_population, skewed_medians
-from ballfg.diagnosis.report.wording import NONE, change, fixed
+from ballfg.diagnosis.report.wording import NONE, change, fixed, term
 from ballfg.diagnosis.result import Diagnosis, Errors
 from ballfg.pages.html import Html, bar, items, picture, section, table, tag, text
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.diagnosis.budget import ErrorBudget
-from ballfg.diagnosis.label_verdicts import LabelCheck
+from ballfg.diagnosis.generic_test import LabelCheck
 from ballfg.diagnosis.report.headline import headline
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page

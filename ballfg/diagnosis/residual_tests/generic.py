@@ -1,11 +1,16 @@
-"""Tests for remaining patterns of any cause, and locates them.
+"""Tests for remaining patterns of any cause, and locates them; tests the noise on tracks outside of the fit.
 
 Each block of patterns (module `patterns`) is tested like a candidate effect: by the scores of its columns, with states
 and declared coefficients projected out and tracks as independent units. Only the most visible directions of a large
 block are tested; their choice does not depend on the residuals.
+
+These tests look at the fit of the search half. Where the halves differ, as with two balls thrown in turn, or where
+predictions see something else than the fit, that fit is good and predictions are not: `predicted_test`.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -13,9 +18,11 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.patterns import DRIFT, EVERYWHERE, PLAUSIBLE, Block, blocks_of, describe_drift, drift_block
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.generic_test import ALARM, APART, GenericTest
+from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest
 from ballfg.diagnosis.hypotheses.signatures import signatures_of
 from ballfg.diagnosis.residual_tests.whiteness import whiteness
+from ballfg.diagnosis.result import Errors
+from ballfg.diagnosis.search.process_noise import MOST_FOR_NOISE
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.tracks.noise import TrackNoise
 
@@ -121,3 +128,30 @@ def where(block: Block, strengths: Array) -> str:
     }[block.kind]
     depends = f"is off {EVERYWHERE}" if name == EVERYWHERE else f"depends on {name}"
     return f"{block.kind}: {what} {block.axes[axis]} {depends}, up to {factor * size:.2g} {unit}"
+
+
+NONE: Final = GenericTest(
+    PREDICTED, f"{PREDICTED}: errors of the held-out tracks are not larger than the model's noise expects", 1.0, 0.0
+)
+
+
+def predicted_test(before: Errors, after: Errors, fitted: int) -> GenericTest:
+    """The test for squared errors beyond those that a model with its noise expects, by the scatter between tracks.
+
+    Args:
+        before, after: errors of the declared and of the corrected model on the held-out half.
+        fitted: number of tracks of the search half. The noise is known as well as so many tracks tell it.
+    Returns: the test; its share is that of the declared model's squared error beyond the corrected model's noise.
+    """
+    judged, told = len(after.by_track), min(fitted, MOST_FOR_NOISE)
+    excess, sigma = after.nis - 1.0, after.nis_error * math.sqrt(1.0 + judged / told)
+    if not (excess > 0.0 and sigma > 0.0 and judged > 1 and told > 1):
+        return NONE
+    from scipy import stats  # it takes half a second to import
+
+    p_value = float(stats.t.sf(excess / sigma, min(judged, told) - 1))
+    left = after.prediction_rmse_mm**2 * excess / after.nis
+    whole = max(left, before.prediction_rmse_mm**2 - after.prediction_rmse_mm**2 + left)
+    times = math.sqrt(after.nis)
+    where = f"{PREDICTED}: errors of the held-out tracks are {times:.2g} times those that the model's noise expects"
+    return replace(NONE, where=where, p_value=p_value, share=left / whole)

@@ -15,9 +15,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
-from ballfg.diagnosis.generic_test import GenericTest
+from ballfg.diagnosis.generic_test import GenericTest, LabelCheck, LabelVerdict
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
-from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
 from ballfg.diagnosis.residual_tests.label_flights import LabelledFlight, labelled_flights
 from ballfg.diagnosis.search.process_noise import noise_about
 from ballfg.dynamics import AnalyticModel

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ballfg.arrays import Mask
-from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import ALIKE, foretold
-from ballfg.diagnosis.evidence.rows import Motion
+from ballfg.diagnosis.evidence.rows import NAMELESS, Motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import Weighed, weighed

@@ -7,9 +7,8 @@ from operator import attrgetter
 
 from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.odds import Odds, odds_of, scores_of
-from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.rows import NAMELESS, Patterns, random_motion
 from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit

@@ -1,7 +1,8 @@
-"""Reports a search round in words and numbers: the added effect, and the ranking of all candidates."""
+"""Reports a search round in words and numbers: the added effect, the ranking of all candidates, implausible values."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from scipy import stats
@@ -14,6 +15,9 @@ from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
 from ballfg.diagnosis.search.candidates import ALARM, Scored
 from ballfg.diagnosis.search.refits import Refit
+from ballfg.dynamics import EFFECTS
+from ballfg.dynamics.effect import Coefficient, Range
+from ballfg.tracks import TABLE_TENNIS
 
 
 def finding_of(
@@ -116,3 +120,48 @@ def _row(scored: Scored, delta_bic: float | None, outcome: Outcome | None) -> Ca
         hidden = all(s > c.sigma > 0.0 for c, s in zip(listed, score.sigma, strict=True))
         outcome = Outcome.INVISIBLE if hidden else Outcome.NOT_NEEDED
     return Candidate(hypothesis.name, kind, estimate, score.explained, scored.p_value, delta_bic, outcome, least)
+
+
+NEAR: Final = 0.15
+"""Relative. Largest difference from the radius of a table-tennis ball, for these ranges to apply."""
+MARGIN: Final = 0.1
+"""Share of a range by which a fitted value may lie outside of it."""
+SIGMAS: Final = 3.0
+"""Largest distance of a plausible value from its range, in standard deviations of the value."""
+
+
+def range_of(name: str, radius: float) -> Range | None:
+    """The plausible range of a coefficient, for a ball of some radius in m; None if unknown."""
+    effect, _, coefficient = name.partition(".")
+    known = EFFECTS.get(effect)
+    if known is None or abs(radius / TABLE_TENNIS.radius - 1.0) > NEAR:
+        return None
+    return known.plausible if coefficient in {c.name for c in known.coefficients if c.absent is not None} else None
+
+
+def implausible(name: str, value: Value, radius: float) -> str:
+    """The reason why a fitted value is implausible; empty if it is plausible, or without a known range.
+
+    Args: name: of effect and coefficient, `wind.x`.  radius: of the ball, m.
+    """
+    known = range_of(name, radius)
+    if known is None:
+        return ""
+    slack = MARGIN * (known.high - known.low)
+    if value.sigma > 0.0:
+        slack = min(slack, SIGMAS * value.sigma)
+    if known.low - slack <= value.value <= known.high + slack:
+        return ""
+    unit = "" if value.unit == "1" else f" {value.unit}"
+    return f"{name} = {value.value:.3g}{unit} lies outside of {known.low:g} to {known.high:g}{unit} ({known.source})"
+
+
+def at_bound(name: str, value: Value, coefficient: Coefficient) -> str:
+    """The finding that tracks pull a coefficient to its bound; empty if it is inside, or held there by the model.
+
+    Args: name: of effect and coefficient.  coefficient: as declared, with its bounds.
+    """
+    if value.value not in (coefficient.low, coefficient.high) or value.value == value.declared:
+        return ""
+    unit = "" if value.unit == "1" else f" {value.unit}"
+    return f"{name} = {value.value:.3g}{unit} is the bound of that coefficient: the tracks ask for more"

@@ -9,11 +9,11 @@ from scipy import stats
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem, followed
-from ballfg.diagnosis.fit.problem import Fit, Problem
+from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
 from ballfg.diagnosis.search.candidates import ALARM, Scored
-from ballfg.diagnosis.search.label_frames import FRAMES
 from ballfg.diagnosis.search.score import Score
+from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.state import SPIN
 
 FIRST_STEPS, USUAL_STEPS = 2, 6
@@ -22,6 +22,12 @@ FIRST_STEPS, USUAL_STEPS = 2, 6
 They lead near the minimum of the deterministic fit, and the likelihood leads on from there. At that minimum itself a
 model that lacks something else has strengths that random motion does not need, often in the range of another maximum.
 """
+UNLABELLED_SPIN = 200.0
+"""rad/s, prior of a spin about zero without labels."""
+FRAMES = 48
+"""Number of exchanges and reversals of axes, including the identity."""
+FRAMES_FITTED = 2
+"""Number of frames that are fitted in full."""
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
 """Cost of a label frame in BIC, for the choice among all frames."""
 
@@ -212,3 +218,42 @@ def delta_bic(before: Fit, after: Fit) -> float:
     more = len(after.problem.free) - len(before.problem.free)
     tracks = len(np.unique(before.problem.stretches.track))
     return 2.0 * (after.cost - before.cost) + more * float(np.log(tracks))
+
+
+def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
+    """The frames of the labels, with other axes or signs, that agree best with the flights.
+
+    Such a change is too large for a score test. Spins are estimated from the flights alone, without labels and with the
+    declared coefficients, because coefficients fitted to wrong labels would be wrong too. The best frames are then
+    fitted in full.
+
+    Args: before: the fit so far.  general: the hypothesis of any other frame.
+    """
+    spins, covariances, labels = _spins_without_labels(before)
+    frames = signed_permutations().numpy()[1:]
+    costs = [_disagreement(labels, spins, covariances, frame, before.noise.label) for frame in frames]
+    best = frames[np.argsort(costs)[:FRAMES_FITTED]].reshape(-1, 9).tolist()
+    shapes = [dict(zip(general.coefficients, frame, strict=True)) for frame in best]
+    return [Hypothesis(general.effect, shape, (), FRAMES - 1) for shape in shapes]
+
+
+def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
+    """(n, 3) spins from the flights alone, their covariances (n, 3, 3) and labels (n, 3), of labelled stretches."""
+    problem = before.problem
+    labelled = problem.stretches.take(problem.stretches.labelled)
+    bare = replace(labelled, labels=torch.full_like(labelled.labels, torch.nan), settings=0.0 * labelled.settings)
+    starts = before.unknowns.starts[problem.stretches.labelled]
+    unknowns = replace(before.unknowns, starts=starts, values=problem.declared)
+    alone = replace(problem, stretches=bare, shared=False)
+    result = fit_problem(alone, unknowns, replace(before.noise, spin=np.full(3, UNLABELLED_SPIN)), settle_noise=False)
+    covariances = np.linalg.inv(result.linearised.start_information)[:, SPIN, SPIN]
+    return result.unknowns.starts[:, SPIN], np.asarray(covariances), labelled.labels.numpy()
+
+
+def _disagreement(labels: Array, spins: Array, covariances: Array, frame: Array, noise: float) -> float:
+    """Robust squared distance between spins and labels in a frame (3, 3)."""
+    covariance = frame @ covariances @ frame.T + noise**2 * np.eye(3)
+    apart = labels - spins @ frame.T
+    square = (apart * np.linalg.solve(covariance, apart[..., None])[..., 0]).sum(axis=-1)
+    robust = 2.0 * LABEL_LOSS.value(np.sqrt(square)) + np.linalg.slogdet(covariance)[1]
+    return float(robust.sum())

@@ -7,8 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from ballfg.diagnosis.evidence.nameless import Patterns
-from ballfg.diagnosis.evidence.rows import Motion
+from ballfg.diagnosis.evidence.rows import Motion, Patterns
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
@@ -16,8 +15,7 @@ from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypot
 from ballfg.diagnosis.hypotheses.signatures import columns_of
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.diagnosis.search.candidates import Scored, leading_sets, score_all, screened, shortlist
-from ballfg.diagnosis.search.label_frames import frame_hypotheses
-from ballfg.diagnosis.search.refits import Attempt, Refit, refit, refit_driven, refit_set, refit_usual
+from ballfg.diagnosis.search.refits import Attempt, Refit, frame_hypotheses, refit, refit_driven, refit_set, refit_usual
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of

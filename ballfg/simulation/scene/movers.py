@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.simulation.scene.room import Colour
-from ballfg.simulation.scene.view import Rect, clipped
+from ballfg.simulation.scene.room import Colour, Rect, clipped
 from ballfg.vision.camera import Camera
 
 PEOPLE: Final = ((0.35, -3.1, 1.5, 0.0), (2.6, 3.2, -1.7, 0.4))

@@ -11,8 +11,8 @@ from ballfg.checks import listed, shown
 from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.flights import Flight, duration, fly_shots
 from ballfg.simulation.scene.renderer import Renderer
+from ballfg.simulation.scene.room import inside
 from ballfg.simulation.scene.shutter import PATH_POINTS, Frames, Passage, frames_of, passages_of
-from ballfg.simulation.scene.view import inside
 from ballfg.vision.camera import Camera
 
 

@@ -19,9 +19,8 @@ from ballfg.arrays import Array
 from ballfg.simulation.scene.backdrop import backdrop
 from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.scene.movers import draw, movers
-from ballfg.simulation.scene.room import Colour
+from ballfg.simulation.scene.room import Colour, Rect, clipped, grown
 from ballfg.simulation.scene.shutter import Frames, Passage
-from ballfg.simulation.scene.view import Rect, clipped, grown
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.vision.camera import Camera
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from ballfg.benchmarks.dynamics.trained import _finished
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
-from ballfg.learning.run.metrics import Epoch, write_metrics
+from ballfg.learning.run.run_folder import Epoch, write_metrics
 
 
 def test_a_stopped_training_is_not_finished(tmp_path: Path) -> None:

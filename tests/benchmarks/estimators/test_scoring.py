@@ -3,8 +3,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.estimators.protocols import Candidate, Case
-from ballfg.benchmarks.estimators.scoring import Scores, TrackScore, every, judged, pooled, score_track, score_tracks
+from ballfg.benchmarks.estimators.protocols import (
+    Candidate,
+    Case,
+    Scores,
+    TrackScore,
+    every,
+    judged,
+    pooled,
+    score_track,
+    score_tracks,
+)
 from ballfg.benchmarks.estimators.suite import _newest_sums, add_consistency, add_rows
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import Surfaces, nominal_model

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis import design_shots, diagnose
-from ballfg.diagnosis.design.levels import combinations, parse_levels
+from ballfg.diagnosis.design.choice import combinations, parse_levels
 from ballfg.diagnosis.design.plan import ShotPlan
 from ballfg.dynamics import EFFECTS, nominal_model
 from ballfg.simulation import parse_effects

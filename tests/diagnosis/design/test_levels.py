@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ballfg.diagnosis.design.levels import combinations, parse_levels
+from ballfg.diagnosis.design.choice import combinations, parse_levels
 
 
 def test_levels_and_their_combinations() -> None:

@@ -10,8 +10,8 @@ import pytest
 
 from ballfg.arrays import Array
 from ballfg.diagnosis import design_shots, hold_out
+from ballfg.diagnosis.design.choice import combinations, parse_levels
 from ballfg.diagnosis.design.goal import hypothesis_of, separating, shrinking
-from ballfg.diagnosis.design.levels import combinations, parse_levels
 from ballfg.diagnosis.design.plan import ShotPlan, _fit_of_all
 from ballfg.diagnosis.fit.fit import covariance_of, fit_problem
 from ballfg.diagnosis.fit.problem import Fit

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from ballfg.diagnosis.evidence.nameless import NAMELESS
 from ballfg.diagnosis.evidence.odds import odds_of, tempered
 from ballfg.diagnosis.evidence.prior import THERE, WIDTHS, choice_odds, log_odds, scales, within
-from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.rows import NAMELESS, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weight, weigh
 from ballfg.diagnosis.fit.problem import Fit

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis.evidence.likelihood import Reduced, held_out, posterior
-from ballfg.diagnosis.evidence.nameless import NAMELESS, Patterns
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, scales
-from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.rows import NAMELESS, Patterns, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import weigh

@@ -11,9 +11,18 @@ import pytest
 import torch
 
 from ballfg.benchmarks.cameras.strokes import MODEL, SETTINGS, SURFACES
-from ballfg.diagnosis.one_view.noise import SHARES, share_of, with_likeliest_noise, with_share
 from ballfg.diagnosis.one_view.picture import CLOCK, LENS
-from ballfg.diagnosis.one_view.strokes import Laws, Stroke, all_estimated, filmed_again, scores_again
+from ballfg.diagnosis.one_view.strokes import (
+    SHARES,
+    Laws,
+    Stroke,
+    all_estimated,
+    filmed_again,
+    scores_again,
+    share_of,
+    with_likeliest_noise,
+    with_share,
+)
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation.observations.sightings import sightings_of
 from tests.diagnosis.one_view.filmed import CAMERA, strokes

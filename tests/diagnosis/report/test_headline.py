@@ -9,9 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.generic_test import GenericTest
-from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict
-from ballfg.diagnosis.report.glossary import OUTCOMES, TERMS
+from ballfg.diagnosis.generic_test import GenericTest, LabelCheck, LabelVerdict
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
@@ -19,7 +17,7 @@ from ballfg.diagnosis.report.pictures import beyond_histogram
 from ballfg.diagnosis.report.predictions import meaning
 from ballfg.diagnosis.report.report import content
 from ballfg.diagnosis.report.shots import distances, error_map, median_shot
-from ballfg.diagnosis.report.wording import OF_A_TRACKER, in_plain_words, plain_name
+from ballfg.diagnosis.report.wording import OF_A_TRACKER, OUTCOMES, TERMS, in_plain_words, plain_name
 from ballfg.diagnosis.residual_tests.label_check import label_test
 from ballfg.diagnosis.result import Diagnosis, Outcome, Unexplained, Value, Verdict
 from ballfg.dynamics import EFFECTS

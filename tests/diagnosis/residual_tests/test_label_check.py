@@ -7,8 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.generic_test import ALARM
-from ballfg.diagnosis.label_verdicts import LabelCheck, LabelVerdict, percent
+from ballfg.diagnosis.generic_test import ALARM, LabelCheck, LabelVerdict, percent
 from ballfg.diagnosis.residual_tests.label_check import (
     NONE_WRONG,
     RIGHT,

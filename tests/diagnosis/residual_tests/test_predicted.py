@@ -11,7 +11,7 @@ import pytest
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.generic_test import ALARM, PREDICTED
 from ballfg.diagnosis.report.headline import headline
-from ballfg.diagnosis.residual_tests.predicted import predicted_test
+from ballfg.diagnosis.residual_tests.generic import predicted_test
 from ballfg.diagnosis.result import Errors, Verdict
 from ballfg.diagnosis.search.evaluation import error_of_mean
 from ballfg.dynamics import EFFECTS, load_model

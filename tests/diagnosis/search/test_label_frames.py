@@ -10,8 +10,7 @@ import torch
 
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.label_frames import FRAMES_FITTED, frame_hypotheses
-from ballfg.diagnosis.search.refits import refit
+from ballfg.diagnosis.search.refits import FRAMES_FITTED, frame_hypotheses, refit
 from ballfg.dynamics.effects.measurement import SpinLabelFrame, signed_permutations
 
 GENERAL = Hypothesis(SpinLabelFrame, {}, tuple(c.name for c in SpinLabelFrame.coefficients))

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.evidence.nameless import NAMELESS
+from ballfg.diagnosis.evidence.rows import NAMELESS
 from ballfg.diagnosis.evidence.weighed import weighed
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps

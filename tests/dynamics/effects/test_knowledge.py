@@ -9,7 +9,7 @@ from torch import Tensor
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.diagnosis.report.wording import in_plain_words, plain_name
 from ballfg.diagnosis.result import Finding, Value
-from ballfg.diagnosis.search.plausible import implausible, range_of
+from ballfg.diagnosis.search.ranking import implausible, range_of
 from ballfg.dynamics import EFFECTS, Coefficient, Flight, FlightEffect, MeasurementEffect, Range, Usual, register
 from ballfg.dynamics.effects import registry
 from ballfg.dynamics.wording import said

@@ -9,7 +9,7 @@ import torch
 
 from ballfg.files import whole_folder
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
-from ballfg.learning.run.metrics import read_metrics
+from ballfg.learning.run.run_folder import read_metrics
 
 
 def made(epoch: int) -> Checkpoint:

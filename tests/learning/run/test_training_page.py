@@ -18,7 +18,7 @@ import tests.learning.run.falling_ball as balls
 from ballfg.learning.cli import run as command
 from ballfg.learning.config.training import OptimizerConfig, SplitConfig, TrainConfig
 from ballfg.learning.run import record, training
-from ballfg.learning.run.metrics import Epoch, read_metrics
+from ballfg.learning.run.run_folder import Epoch, read_metrics
 from ballfg.learning.run.training_page import TERMS, beside_untrained, improved, page, verdict
 from ballfg.learning.trainee import Learned, PredictedShot
 from tests.html_page import HtmlPage

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.cameras.hall import COURT, Look, looking, panned, picture
-from ballfg.benchmarks.cameras.looks import ORANGE
+from ballfg.benchmarks.cameras.hall import COURT, ORANGE, Look, looking, panned, picture
 from ballfg.vision.broadcast.candidates import aligned_candidates
 from ballfg.vision.broadcast.find import find_court, joined_segments
 from ballfg.vision.broadcast.motion import find_motion
