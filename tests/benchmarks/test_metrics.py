@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.gaussian_settings import StepNoise
 from ballfg.benchmarks.metrics import (
     bootstrap,
     chi_square_band,
@@ -92,3 +93,11 @@ def test_median_stands_between_the_extremes() -> None:
     assert (figure.value, figure.low, figure.high) == (2.5, 1.0, np.inf)
     with pytest.raises(ValueError, match="values must not be empty"):
         median_and_range([])
+
+
+def test_step_noise_does_not_depend_on_the_step_but_for_spin() -> None:
+    covariance = StepNoise(spin=2.0, step_position=0.1, step_velocity=0.3).flight(np.array([0.01, 0.04]))
+    expected = np.diag([0.01] * 3 + [0.09] * 3 + [0.04] * 3)
+    np.testing.assert_allclose(covariance[0], expected)
+    expected[6:, 6:] *= 4
+    np.testing.assert_allclose(covariance[1], expected)

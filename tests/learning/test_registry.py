@@ -1,4 +1,4 @@
-"""Kinds of one's own beside those of the package: names, defaults and the section that is theirs."""
+"""Kinds of one's own beside those of the package: names, defaults, section. Sub-rooms of learning import one way."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 from ballfg.learning import Prepared, TrainConfig, TraineeKind, build, register_trainee
 from ballfg.learning.trainee import TRAINEES
 from tests.learning.run.falling_ball import FallingBalls
+from tests.test_layout import MODULES, imported
 
 GIVEN = {"kind": "heavy", "options": {"masses": [1.0, 2.0]}, "data": "plain"}
 
@@ -61,3 +62,20 @@ def test_names_are_taken_once() -> None:
         register_trainee(Second)
     with pytest.raises(TypeError, match="trainee must be a subclass of TraineeKind"):
         register_trainee(FallingBalls.__mro__[1])
+
+
+ORDER = {"config": 0, "gradient": 0, "run": 1, "end_to_end": 2, "sequence": 2, "calibration": 3}
+"""A module imports from its own sub-room and from those of a lower number."""
+
+
+def sub_room(module: str) -> str | None:
+    parts = module.split(".")
+    return parts[2] if parts[:2] == ["ballfg", "learning"] and len(parts) > 3 else None
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if sub_room(name)])
+def test_sub_rooms_import_one_way(module: str) -> None:
+    mine = sub_room(module)
+    for line, name in imported(module, MODULES[module]):
+        other = sub_room(name)
+        assert other in (None, mine) or ORDER[other] < ORDER[mine], f"{MODULES[module]}:{line}: {mine} imports {other}"

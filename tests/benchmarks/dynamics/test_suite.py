@@ -1,4 +1,4 @@
-"""A small run with the two methods that need no training, its records, rows and pictures."""
+"""A small run: records, rows, pictures. A training that was stopped goes on, although a best model is there."""
 
 import importlib.util
 import json
@@ -12,9 +12,12 @@ from ballfg.benchmarks.dynamics.contenders import Job, Record, fan_of, nominal_c
 from ballfg.benchmarks.dynamics.jobs import METHODS, collect_records
 from ballfg.benchmarks.dynamics.measured import measured_shot
 from ballfg.benchmarks.dynamics.suite import Plan, _installed, add_rows, run_dynamics
+from ballfg.benchmarks.dynamics.trained import _finished
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status
+from ballfg.learning.config.training import OptimizerConfig, TrainConfig
+from ballfg.learning.run.run_folder import Epoch, write_metrics
 from ballfg.tracks import Track
 
 SMALL = Plan(tracks=12, measured=None, seeds=2, quick=True)
@@ -166,3 +169,15 @@ def test_a_method_whose_package_is_missing_is_left_out_and_said_to_be(
     with pytest.raises(ValueError, match=r"--method diffusion\+aug .* pip install 'ballfg\[diffusion\]'"):
         _installed(["nominal", "diffusion+aug"])
     assert _installed(["nominal"]) == ("nominal",)
+
+
+def test_a_stopped_training_is_not_finished(tmp_path: Path) -> None:
+    config = TrainConfig(kind="mlp", optimizer=OptimizerConfig(epochs=2))
+    rows = [Epoch(i, None, None, 0.05, 1e-3, None, 0, 0, 0, 1.0) for i in range(3)]
+    assert not _finished(tmp_path, config)
+    write_metrics(tmp_path / "metrics.csv", rows)
+    assert not _finished(tmp_path, config)
+    (tmp_path / "model.yaml").write_text("{}")
+    assert _finished(tmp_path, config)
+    write_metrics(tmp_path / "metrics.csv", rows[:2])
+    assert not _finished(tmp_path, config)

@@ -1,22 +1,34 @@
-"""Tests for patterns without a name: alarms as rare as stated, planted patterns found and put into words."""
+"""Tests for patterns without a name: alarms as rare as stated, planted patterns found and put into words.
+
+What is left is noise only if the other half of the tracks errs as that noise expects.
+"""
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.fit.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
 from ballfg.diagnosis.fit.response import fitted_path, responses
-from ballfg.diagnosis.generic_test import ALARM
+from ballfg.diagnosis.generic_test import ALARM, PREDICTED
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import Signatures, hypothesis_columns
-from ballfg.diagnosis.residual_tests.generic import generic_tests, where
+from ballfg.diagnosis.report.headline import headline
+from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test, where
 from ballfg.diagnosis.residual_tests.whiteness import REACHES, whiteness
+from ballfg.diagnosis.result import Errors, Verdict
+from ballfg.diagnosis.search.evaluation import error_of_mean
 from ballfg.diagnosis.search.score import pattern_tests
+from ballfg.dynamics import EFFECTS, load_model
 from ballfg.dynamics.effects.generic import GenericFlight
+from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
+from ballfg.tracks import read_dataset
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own
 PULL = -0.6
@@ -175,3 +187,61 @@ def test_where_names_the_largest_part():
     assert where(block, strengths) == "measurement: error of position vertically depends on height, up to 4.8 mm"
     strengths = np.array(((0.9, 0.1), (0.0, 0.0), (0.0, 0.5)))
     assert where(block, strengths).startswith("measurement: error of position along x is off everywhere, up to ")
+
+
+def errors(rmse_mm: float, nis: float, nis_error: float, tracks: int = 8) -> Errors:
+    return Errors(rmse_mm, 0.0, nis, 0.0, np.full(tracks, rmse_mm), nis_error=nis_error)
+
+
+def odd_or_even(folder: Path, rest: int) -> list[dict[str, str]]:
+    """Rows of every second track."""
+    with (folder / "tracks.csv").open(encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if int(row["trajectory"]) % 2 == rest]
+
+
+def test_chance_raises_no_alarm():
+    """The noise is known from as many tracks as are judged, and errors of a track go together: two are independent."""
+    rng, loud = np.random.default_rng(2), 0
+    for _ in range(4000):
+        known = rng.chisquare(2, 10).mean() / 2.0
+        squares = [np.repeat(one / 2.0 / known, 30) for one in rng.chisquare(2, 10)]
+        judged = errors(9.0, float(np.mean(squares)), error_of_mean(squares), 10)
+        loud += predicted_test(judged, judged, 10).p_value < ALARM
+    assert loud < 4000 * 2 * ALARM
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "share"),
+    [
+        (errors(100.0, 20.0, 2.0), errors(100.0, 20.0, 2.0), 1.0),  # nothing found: all of it is left
+        (errors(100.0, 20.0, 2.0), errors(10.0, 2.0, 0.1), 50.0 / 9950.0),
+        (errors(50.0, 20.0, 2.0), errors(100.0, 20.0, 2.0), 1.0),  # predictions got worse
+    ],
+)
+def test_the_share_is_that_of_the_squared_error_beyond_the_noise(before, after, share):
+    test = predicted_test(before, after, 8)
+    assert test.p_value < ALARM
+    assert test.share == pytest.approx(share)
+
+
+def test_without_a_scatter_nothing_is_said():
+    for after in (errors(9.0, 2.0, float("nan"), 1), errors(9.0, float("nan"), 0.1), errors(9.0, 0.8, 0.1)):
+        assert predicted_test(after, after, 8).p_value == 1.0
+
+
+def test_balls_thrown_in_turn_are_not_noise(tmp_path):
+    """A fan runs at every second shot: the half that is searched sees none of it, and fits well."""
+    for name, effects in (("still", ()), ("fan", parse_effects(["wind.x=1"]))):
+        write_simulation(tmp_path / name, SimulationConfig(tracks=12, rate=60.0, seed=5, undeclared=effects))
+    rows = [row for rest, name in enumerate(("still", "fan")) for row in odd_or_even(tmp_path / name, rest)]
+    with (tmp_path / "still" / "tracks.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(sorted(rows, key=lambda row: row["trajectory"]))
+    folder = tmp_path / "still"
+    model = load_model(folder / "model.yaml")
+    diagnosis = diagnose(read_dataset(folder), model, catalogue=[EFFECTS["spin_decay"]])
+    assert not diagnosis.findings
+    assert diagnosis.verdict is Verdict.UNEXPLAINED
+    assert diagnosis.unexplained.where.startswith(f"{PREDICTED}: ")
+    assert "noise expects" in headline(diagnosis)
