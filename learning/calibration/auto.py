@@ -6,10 +6,8 @@ judged with the noise that the tracks show. A richer model must beat the best si
 than its standard error over the tracks, calibration by any amount that someone notices; docs/train.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -17,18 +15,14 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.checks import aligned
 from ballfg.dynamics import AnalyticModel
-from ballfg.estimation import Estimator, Settings
-from ballfg.estimation.batch import map_tracks
+from ballfg.estimation import Settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
-from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration import calibrate
 from ballfg.learning.calibration.groups import OWN, Groups
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import Plain, TrackScore, judge_track, summary
-from ballfg.learning.split import tracks_of
+from ballfg.learning.evaluation import Plain, TrackScore, summary
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import Track
 
 NOMINAL: Final = "nominal"
 PER_TRACK: Final = "per-track coefficients"
@@ -170,24 +164,10 @@ def _folds(
 def _judged(
     problem: calibrate.Problem, made: Sequence[tuple[AnalyticModel, Settings]], watch: Watch
 ) -> tuple[TrackScore | None, ...]:
-    """Scores of the fitted tracks' forecasts: from the config's share of each, and half-way before and after it.
-
-    Args: made: model and settings of each fold; one of all tracks is the fold of all.
-    """
-    share, longest, names = problem.config.observed_share, problem.config.horizon, problem.split.fit
+    """Scores of the fitted tracks' forecasts: from the config's share of each, and half-way before and after it."""
+    share, longest = problem.config.observed_share, problem.config.horizon
     shares, horizon = (share / 2.0, share, (1.0 + share) / 2.0), NEAR if longest is None else min(NEAR, longest)
-    smoothers = [make_estimator("smoother", model, problem.surfaces, settings) for model, settings in made]
-    of_track = {name: smoothers[k % len(smoothers)] for k, name in enumerate(names)}
-    tracks = tracks_of(problem.dataset, names)
-    scores = map_tracks(partial(_forecasts, of_track, shares, horizon), tracks, len(names), problem.jobs)
-    return tuple(chain(*watch(scores, len(names), "tracks judged")))
-
-
-def _forecasts(
-    smoothers: Mapping[str, Estimator], shares: Sequence[float], horizon: float, track: Track
-) -> list[TrackScore | None]:
-    """Scores of one track's forecasts from each share of it, by its own smoother."""
-    return [judge_track(smoothers[track.name], track, share, horizon) for share in shares]
+    return calibrate.judged(problem, made, problem.split.fit, shares, horizon, watch)
 
 
 def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:

@@ -5,9 +5,10 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Final, Self
 
 import numpy as np
@@ -42,7 +43,7 @@ from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import JUDGED, Plain, TrackScore, judge_track
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import Dataset
+from ballfg.tracks import Dataset, Track
 from ballfg.tracks.noise import TrackNoise
 
 ROUGHLY: Final = 0.3
@@ -79,10 +80,6 @@ class Problem:
         if self.shown is None:
             return self.settings
         return with_noise(self.settings, replace(self.shown, coefficients={}, spin_label=None))
-
-    def estimator(self, values: Array, settings: Settings) -> Smoother:
-        """The smoother with values (p,) of the coefficients."""
-        return Smoother(with_values(self.model, self.chosen.names, values), self.surfaces, settings)
 
 
 class TrackFit(Plain):
@@ -209,7 +206,8 @@ def first_step(problem: Problem, watch: Watch = unwatched) -> Step:
 
 def with_scores(problem: Problem, step: Step, watch: Watch = unwatched) -> Step:
     """A step with the scores of the judging tracks."""
-    return step.model_copy(update={"scores": score(problem, np.array(step.mean), watch)})
+    model = with_values(problem.model, problem.chosen.names, np.array(step.mean))
+    return step.model_copy(update={"scores": score(problem, model, problem.settings, watch)})
 
 
 def has_converged(config: CalibrationConfig, step: Step) -> bool:
@@ -223,26 +221,38 @@ def has_ended(config: CalibrationConfig, step: Step) -> bool:
 
 
 def score(
-    problem: Problem, values: Array | AnalyticModel, watch: Watch = unwatched, settings: Settings | None = None
+    problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
 ) -> tuple[TrackScore | None, ...]:
-    """Scores of the judging tracks, in order.
-
-    Args:
-        values: (p,) of the coefficients, or a model with them.
-        watch: called for each track.
-        settings: None: the problem's.
-    """
-    config, names = problem.config, problem.split.judge
+    """Scores of the judging tracks, in order, by a model with its settings."""
+    config = problem.config
     horizon = np.inf if config.horizon is None else config.horizon
-    estimator: Estimator
-    if isinstance(values, AnalyticModel):
-        estimator = make_estimator("smoother", values, problem.surfaces, settings or problem.settings)
-    else:
-        estimator = problem.estimator(values, settings or problem.settings)
-    tracks = tracks_of(problem.dataset, names)
-    judge = partial(judge_track, estimator, observed_share=config.observed_share, horizon=horizon)
-    scores = map_tracks(judge, tracks, len(names), problem.jobs)
-    return tuple(watch(scores, len(names), "tracks judged"))
+    return judged(problem, [(model, settings)], problem.split.judge, (config.observed_share,), horizon, watch)
+
+
+def judged(
+    problem: Problem,
+    made: Sequence[tuple[AnalyticModel, Settings]],
+    names: Sequence[str],
+    shares: Sequence[float],
+    horizon: float,
+    watch: Watch,
+) -> tuple[TrackScore | None, ...]:
+    """Scores of the forecasts of some tracks from some shares of each, track after track.
+
+    Args: made: model and settings of each fold of the tracks; one of all tracks is the fold of all.
+    """
+    smoothers = [make_estimator("smoother", model, problem.surfaces, settings) for model, settings in made]
+    of_track = {name: smoothers[k % len(smoothers)] for k, name in enumerate(names)}
+    forecasts, tracks = partial(_forecasts, of_track, shares, horizon), tracks_of(problem.dataset, names)
+    scores = map_tracks(forecasts, tracks, len(names), problem.jobs)
+    return tuple(chain.from_iterable(watch(scores, len(names), "tracks judged")))
+
+
+def _forecasts(
+    smoothers: Mapping[str, Estimator], shares: Sequence[float], horizon: float, track: Track
+) -> list[TrackScore | None]:
+    """Scores of one track's forecasts from each share of it, by its own smoother."""
+    return [judge_track(smoothers[track.name], track, share, horizon) for share in shares]
 
 
 def population_settings(problem: Problem, step: Step) -> Settings:
@@ -355,7 +365,8 @@ def linearised(problem: Problem, last: Step, watch: Watch = unwatched) -> Linear
     settings = problem.linearising
     priors = {**settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
     settings = replace(settings, coefficients=priors)
-    estimator = problem.estimator(about, settings if groups is None else groups.wide(settings, spins))
+    model = with_values(problem.model, chosen.names, about)
+    estimator = Smoother(model, problem.surfaces, settings if groups is None else groups.wide(settings, spins))
     tracks = tracks_of(problem.dataset, names)
     if problem.correction is not None:
         tracks = (track.opening(FIRST) for track in tracks)

@@ -201,8 +201,8 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
     last = steps[-1]
     population, model = population_settings(problem, last), population_model(problem, last)
     noise = fitted_noise(problem, model, population, watch)
-    spread = score(problem, model, watch, population)
-    shown = spread if noise is None else score(problem, model, watch, noise.settings)
+    spread = score(problem, model, population, watch)
+    shown = spread if noise is None else score(problem, model, noise.settings, watch)
     after = last.scores if problem.correction is None else spread  # a correction goes with its spins
     comparison = compare(steps[0].scores, after, spread, shown)
     if comparison.gain is not None and comparison.gain.word == "no different" and noise is not None:
@@ -225,7 +225,7 @@ def _density(problem: Problem, written: Sequence[TrackScore | None], watch: Watc
     noise = fitted_noise(problem, problem.model, problem.settings, watch, errors=False)
     if noise is None:
         return None
-    before = score(problem, problem.model, watch, noise.settings)
+    before = score(problem, problem.model, noise.settings, watch)
     pairs = [(b.log_score, a.log_score) for b, a in zip(before, written, strict=True) if b and a]
     return denser(*np.array(pairs).T) if len(pairs) > 1 else None
 

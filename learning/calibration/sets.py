@@ -168,7 +168,7 @@ def _judged(one: OneSet, others: Sequence[OneSet], watch: Watch) -> Pairs:
 def _scores(problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch) -> tuple[TrackScore | None, ...]:
     """With the noise that the set's fitted tracks show about the model."""
     noise = fitted_noise(problem, model, settings, watch, errors=False)
-    return score(problem, model, watch, settings if noise is None else noise.settings)
+    return score(problem, model, settings if noise is None else noise.settings, watch)
 
 
 def _gain(pairs: Pairs) -> Gain | None:

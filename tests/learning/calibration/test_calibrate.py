@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Status
+from ballfg.estimation import Smoother, Status
 from ballfg.learning.calibration import calibrate as module, run
 from ballfg.learning.calibration.calibrate import (
     Problem,
@@ -185,7 +185,7 @@ def test_split_by_label(few_tracks: Path, tmp_path: Path) -> None:
 
 def test_a_track_with_nothing_left_is_not_judged(few_tracks: Path) -> None:
     problem = posed(few_tracks)
-    estimator = problem.estimator(problem.chosen.start, problem.settings)
+    estimator = Smoother(problem.model, problem.surfaces, problem.settings)
     track = next(iter(problem.dataset))
     assert judge_track(estimator, track.until(track.times[0]), 0.4, np.inf) is None
     assert judge_track(estimator, track, 0.9999, np.inf) is not None

@@ -131,7 +131,7 @@ def test_other_flights_are_predicted_better_and_intervals_hold(curved: tuple[Pro
     found = []
     for problem, step in (curved[:2], curved[2:]):
         settings = population_settings(replace(problem, settings=curved[2].linearising), step)
-        scores = score(problem, population_model(problem, step), settings=settings)
+        scores = score(problem, population_model(problem, step), settings)
         found.append(summary([one for one in scores if one is not None]))
     plain, better = found
     assert plain is not None

@@ -23,6 +23,7 @@ from ballfg.learning.calibration.calibrate import (
     Step,
     calibrate,
     has_converged,
+    population_model,
     population_settings,
     pose,
     score,
@@ -108,7 +109,7 @@ def test_other_tracks_are_predicted_better_with_intervals_that_hold(steps: list[
     with_groups = population_settings(problem, last)
     without = replace(with_groups, spins=None, group=None)
     found, plain = (
-        summary([s for s in score(problem, np.array(last.mean), settings=settings) if s is not None])
+        summary([s for s in score(problem, population_model(problem, last), settings) if s is not None])
         for settings in (with_groups, without)
     )
     assert found is not None
