@@ -87,56 +87,75 @@ def diagnose(
     tell("looking at what is left")
     of_fit = noise_of_all_frames(tracker, holdout.stamps, dataset)
     labels, of_labels = _labels(search, model, with_all_frames(holdout, dataset), holdout.stamps, of_fit, jobs)
-    of_noise = predicted_test(search.before, search.judged, len(np.unique(holdout.search.track)))
+    searched = len(np.unique(holdout.search.track))
+    of_noise = predicted_test(search.before, search.judged, searched)
     tests = in_order(*generic_tests(search.fit, search.first, of_fit), of_noise, *of_labels)
-    verdict = verdict_of(search, tests)
     helped = None
-    if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
+    if verdict_of(search, tests) is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
         helped = fallback(search.fit, embedding, corrected, holdout.dataset, parts, search.judged, evaluate, jobs)
-    unexplained = what_is_left(tests, helped)
-    residuals = residuals_of(search.first)
-    declared = {name: float(value.detach()) for name, value in model.named_parameters()}
-    calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
     whole = next_shot_model(search.whole, holdout.launcher.embedding, corrected)
     whole.noise = corrected.noise
     whole.domain = Domain.of(dataset, [dataset.info.ball.radius]) if search.findings else model.domain
-    after = search.judged if helped is None else helped.after
-    budget = budget_of(corrected, holdout, search.before.prediction_rmse_mm, after.prediction_rmse_mm, jobs)
+    found = told(search, model, dataset.info.name, whole, searched, tests, labels, helped)
+    budget = budget_of(corrected, holdout, found.before.prediction_rmse_mm, found.after.prediction_rmse_mm, jobs)
+    unpopulated = search.before
+    if has_population(search.declared):
+        unpopulated = evaluate(as_declared(unpopulated_model(search.declared, holdout, jobs), holdout.stamps))
+    return replace(
+        found,
+        unpopulated=unpopulated,
+        noise=_noise(search.fit, holdout),
+        excluded=holdout.excluded,
+        floor_mm=float("nan") if budget is None else budget.exact,
+        budget=budget,
+    )
+
+
+def told(
+    search: Search,
+    declared: AnalyticModel,
+    dataset: str,
+    corrected: BallModel,
+    searched: int,
+    tests: tuple[GenericTest, ...],
+    labels: LabelCheck | None,
+    helped: Fallback | None = None,
+) -> Diagnosis:
+    """The result of a search, without what is of one dataset alone: noise, excluded tracks, budget.
+
+    Args:
+        declared, corrected: the models before and after, the latter without the fallback.
+        dataset: its name.  searched: number of tracks of the search half.
+        tests, labels: of what is left, and verdicts on spin labels.  helped: a description without a name.
+    """
+    verdict, unexplained = verdict_of(search, tests), what_is_left(tests, helped)
+    given = {name: float(value.detach()) for name, value in declared.named_parameters()}
+    calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in given], given)
+    residuals = residuals_of(search.first)
     return Diagnosis(
-        dataset=dataset.info.name,
+        dataset=dataset,
         verdict=verdict,
         sentence=sentence(verdict, search.findings, unexplained),
         findings=search.findings,
         rounds=search.rounds,
         before=search.before,
-        after=after,
-        unpopulated=_unpopulated(search, holdout, evaluate, jobs),
-        tracks_found_on=len(np.unique(holdout.search.track)),
+        after=search.judged if helped is None else helped.after,
+        tracks_found_on=searched,
         tracks_judged_on=len(search.before.by_track),
         calibrated=calibrated,
-        noise=_noise(search.fit, holdout),
+        noise={},
         unexplained=unexplained,
-        model=whole if helped is None else helped.model,
+        model=corrected if helped is None else helped.model,
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
-        excluded=holdout.excluded,
-        remarks=tuple(strange(search.whole, calibrated, model.radius)),
-        floor_mm=float("nan") if budget is None else budget.exact,
+        remarks=tuple(strange(search.whole, calibrated, declared.radius)),
         labels=labels,
         probabilities=search.odds.effects(),
         nothing_lacking=search.odds.nothing,
         nameless=search.odds.nameless,
-        budget=budget,
     )
-
-
-def _unpopulated(search: Search, holdout: Holdout, evaluate: Callable[[BallModel], Errors], jobs: int) -> Errors:
-    """Errors of the declared model with the prior of any spin."""
-    if not has_population(search.declared):
-        return search.before
-    return evaluate(as_declared(unpopulated_model(search.declared, holdout, jobs), holdout.stamps))
 
 
 def _labels(

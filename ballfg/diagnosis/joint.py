@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from ballfg.checks import check_range
-from ballfg.diagnosis.diagnosis import in_order, strange, verdict_of, what_is_left
-from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
+from ballfg.diagnosis.diagnosis import in_order, told
+from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.patterns import DRIFT
@@ -25,10 +25,9 @@ from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.generic_test import LabelCheck
 from ballfg.diagnosis.hypotheses.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
-from ballfg.diagnosis.report.wording import joined as listed, sentence
+from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
-from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.loop import NAMED, SearchLoop
 from ballfg.diagnosis.search.process_noise import calibrated_model, errors_of, fitted_model, noise_about
@@ -108,35 +107,11 @@ def diagnose_jointly(
     patterns = (test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
     searched = len(np.unique(halves.search.track))
     tests = in_order(*patterns, predicted_test(search.before, search.judged, searched), *of_labels)
-    verdict = verdict_of(search, tests)
-    unexplained = what_is_left(tests)
-    declared = {name: float(value.detach()) for name, value in model.named_parameters()}
-    calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
     remarks = [*_of_whom(search.findings), *predicting.errors_by_room(search.declared, search.predictive)]
-    whole = Diagnosis(
-        dataset=", ".join(room.name for room in rooms),
-        verdict=verdict,
-        sentence=sentence(verdict, search.findings, unexplained),
-        findings=search.findings,
-        rounds=search.rounds,
-        before=search.before,
-        after=search.judged,
-        tracks_found_on=searched,
-        tracks_judged_on=len(search.before.by_track),
-        calibrated=calibrated,
-        noise={},
-        unexplained=unexplained,
-        model=_of_a_new_room(search.whole, model),
-        residuals_before=residuals_of(search.first),
-        residuals_after=residuals_of(search.fit),
-        excluded=tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded),
-        remarks=(*remarks, *strange(search.whole, calibrated, model.radius)),
-        labels=labels,
-        probabilities=search.odds.effects(),
-        nothing_lacking=search.odds.nothing,
-        nameless=search.odds.nameless,
-    )
-    return JointDiagnosis(whole, models)
+    together, of_ball = ", ".join(room.name for room in rooms), _of_a_new_room(search.whole, model)
+    whole = told(search, model, together, of_ball, searched, tests, labels)
+    excluded = tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded)
+    return JointDiagnosis(replace(whole, excluded=excluded, remarks=(*remarks, *whole.remarks)), models)
 
 
 def _labels(
