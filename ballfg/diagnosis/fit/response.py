@@ -7,7 +7,7 @@ thus serves every pattern of forces. The columns of P for velocity and spin are 
 contact.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,10 +17,9 @@ import torch.autograd.forward_ad as forward
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.sensitivity import coefficients_of, with_values
 from ballfg.diagnosis.fit.shooting import LEAST_ARC, Arc, Trajectories, shoot
-from ballfg.diagnosis.fit.tangents import RepeatedMotion, shoot_compiled
+from ballfg.diagnosis.fit.tangents import RepeatedMotion, make_dual, shoot_compiled
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.state import STATE_DIM, VELOCITY
@@ -154,7 +153,9 @@ def _shot(fit: "Fit", path: FittedPath, number: int, part: Tensor, nodes: Tensor
     guesses = path.motion.contacts[rows, number:] - begun.unsqueeze(-1)
     functions = compiled(model) if model.measures_plainly else None
     if functions is None:
-        return _dual_shot(_repeated(model, values, len(rows)), start, heights, guesses, times, nodes)
+        tiled = {n: value if isinstance(value, float) else np.tile(value, STATE_DIM) for n, value in values.items()}
+        repeated = with_values(model, tiled, len(rows) * STATE_DIM)  # component by component of the state
+        return _dual_shot(repeated, start, heights, guesses, times, nodes)
     unit = np.tile(np.eye(STATE_DIM), (len(rows), 1, 1))
     known = coefficients_of(model, len(rows), values)
     shot = shoot_compiled(functions, known, start.numpy(), unit, heights, guesses, times[-1])
@@ -164,18 +165,12 @@ def _shot(fit: "Fit", path: FittedPath, number: int, part: Tensor, nodes: Tensor
     return reached.numpy(), by_first.numpy(), positions.numpy()
 
 
-def _repeated(model: BallModel, values: Mapping[str, float | Array], count: int) -> BallModel:
-    """The model for `count` balls, each repeated for the components of its state, component by component."""
-    tiled = {n: value if isinstance(value, float) else np.tile(value, STATE_DIM) for n, value in values.items()}
-    return with_values(model, tiled, count * STATE_DIM)
-
-
 def _dual_shot(
     model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, times: Tensor, nodes: Tensor
 ) -> tuple[Array, Array, Array]:
     """The same in dual numbers, for every model."""
     m, times = len(start), times.repeat(1, STATE_DIM)
-    with dual_level():
+    with forward.dual_level():
         directions = torch.eye(STATE_DIM, dtype=torch.float64).repeat_interleave(m, dim=0)
         first = make_dual(start.repeat(STATE_DIM, 1), directions)
         motion = shoot(model, first, heights.repeat(STATE_DIM, 1), guesses.repeat(STATE_DIM, 1), times[-1])

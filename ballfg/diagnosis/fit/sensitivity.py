@@ -14,10 +14,9 @@ import torch.autograd.forward_ad as forward
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.fit.stretches import Stretches, of_similar_length
-from ballfg.diagnosis.fit.tangents import Coefficients, MovedArc, RepeatedMotion, shoot_compiled
+from ballfg.diagnosis.fit.tangents import Coefficients, MovedArc, RepeatedMotion, make_dual, shoot_compiled
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
 from ballfg.dynamics.model import substitute
@@ -236,7 +235,7 @@ def _slopes(outputs: Tensor, leaves: Sequence[Tensor]) -> Tensor:
 
 
 def _derivatives(asked: _Asked) -> Sensitivity:
-    with dual_level():
+    with forward.dual_level():
         repeated, dual, state = asked.repeated()
         times, d = _true_times(dual, repeated), len(asked.wanted)
         motion = shoot(dual, state, repeated.heights, repeated.contacts, times[-1].detach())

@@ -5,6 +5,7 @@ states and slopes, with weights that depend on the time alone; so are its deriva
 the samples.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Self
@@ -15,7 +16,6 @@ import torch.autograd.forward_ad as forward
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.fit.dual import make_dual
 from ballfg.diagnosis.fit.shooting import Arc, steps_of_arc
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import fly_arcs
@@ -23,6 +23,17 @@ from ballfg.dynamics.compiled.functions import NONE, CompiledModel, Function
 from ballfg.dynamics.compiled.samples import sample
 from ballfg.dynamics.motion.limits import LONGEST_FALL
 from ballfg.state import STATE_DIM
+
+
+def make_dual(primal: Tensor, tangent: Tensor) -> Tensor:
+    """A tensor with a tangent, within torch's `dual_level()`.
+
+    The first call makes torch 2.13 compile its own rules with `torch.jit.script`, whose deprecation warning callers
+    cannot avoid; it would be an error in a process that turns warnings into errors.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`torch.jit.script` is deprecated", DeprecationWarning)
+        return forward.make_dual(primal, tangent)
 
 
 class RepeatedMotion:
