@@ -106,7 +106,7 @@ def fit_problem(
     result = _minimise(Fit.at(problem, unknowns, noise), steps)
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
         before, noise = result.noise, _settled(result)
-        result = _minimise(Fit.at(result.problem, result.unknowns, noise, result.steps))
+        result = _minimise(Fit.at(result.problem, result.unknowns, noise))
         ratios = np.append(noise.position / before.position, noise.spin / before.spin)
         if bool(np.abs(np.log(ratios)).max() < SETTLED):
             break
@@ -123,7 +123,7 @@ def followed(fit: Fit, unknowns: Unknowns) -> Fit:
     values = np.array([unknowns.values[name] - fit.unknowns.values[name] for name in names])
     step = np.concatenate((values, (unknowns.launcher - fit.unknowns.launcher).ravel()))
     starts = fit.unknowns.starts + system.eliminated().start_step(step)
-    moved = Fit.at(fit.problem, replace(unknowns, starts=starts), fit.noise, fit.steps)
+    moved = Fit.at(fit.problem, replace(unknowns, starts=starts), fit.noise)
     for _ in range(CORRECTIONS):
         moved = _followed_up(moved, system, fit.robust)
     return moved
@@ -151,7 +151,7 @@ def covariance_of(fit: Fit, names: Sequence[str]) -> Array:
 def _minimise(now: Fit, steps: int = MOST_STEPS) -> Fit:
     damping = FIRST_DAMPING
     for _ in range(steps if np.isfinite(now.cost) else 0):
-        now = with_guesses(replace(now, steps=now.steps + 1))
+        now = with_guesses(now)
         moved, damping = _step(now, damping)
         if moved is None:
             break
@@ -188,7 +188,7 @@ def _moved(now: Fit, system: System, damping: float) -> Fit:
     eliminated = system.eliminated(damping)
     step = eliminated.common_step(precision, pull, *now.limits, damping) if problem.shared else np.zeros_like(pull)
     starts = unknowns.starts + eliminated.start_step(step)
-    return Fit.at(problem, replace(now.stepped(step), starts=starts), now.noise, now.steps)
+    return Fit.at(problem, replace(now.stepped(step), starts=starts), now.noise)
 
 
 def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:

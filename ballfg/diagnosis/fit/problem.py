@@ -1,6 +1,6 @@
 """Defines a fit problem with its unknowns, priors and losses, and linearises its rows."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Self
@@ -126,23 +126,19 @@ class Robust:
 
 @dataclass(frozen=True)
 class Fit:
-    """Unknowns of a problem and their predicted samples, after some Gauss-Newton steps.
-
-    The result of a fit is this at the minimum.
-    """
+    """Unknowns of a problem and their predicted samples; the result of a fit is this at the minimum."""
 
     problem: Problem
     unknowns: Unknowns
     noise: Noise
     predicted: Predicted
-    steps: int = 0
 
     @classmethod
-    def at(cls, problem: Problem, unknowns: Unknowns, noise: Noise, steps: int = 0) -> Self:
+    def at(cls, problem: Problem, unknowns: Unknowns, noise: Noise) -> Self:
         """The prediction at some unknowns."""
         values = problem.by_stretch(unknowns.values)
         predicted = predict(problem.model, problem.stretches, unknowns.starts, values)
-        return cls(problem, unknowns, noise, predicted, steps)
+        return cls(problem, unknowns, noise, predicted)
 
     @property
     def values(self) -> dict[str, float | Array]:
@@ -242,7 +238,9 @@ class Fit:
             return Sensitivity(np.pad(found.positions, [(0, 0), *none]), np.pad(found.labels, none))
         behind = [deviations[name].coefficient if name in deviations else name for name in problem.free]
         names = list(dict.fromkeys(behind))
-        found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, self._known(names), names)
+        parameters = dict(problem.model.named_parameters())
+        known = {name: float(parameters[name].detach()) for name in names} | self.values
+        found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, known, names)
         if not deviations:
             return found
         chosen = [*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in behind)]
@@ -253,11 +251,6 @@ class Fit:
         return Sensitivity(
             found.positions[..., chosen] * weights[:, None, None], found.labels[..., chosen] * weights[:, None]
         )
-
-    def _known(self, names: Iterable[str]) -> dict[str, float | Array]:
-        """All fitted coefficients, and the model's own values of further names."""
-        parameters = dict(self.problem.model.named_parameters())
-        return {name: float(parameters[name].detach()) for name in names} | self.values
 
     @cached_property
     def path(self) -> FittedPath:

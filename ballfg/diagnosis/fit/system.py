@@ -87,10 +87,6 @@ class System:
         """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""
         return System(residual, self.by_start, self.by_common[..., :0]).eliminated().solved[..., 0]
 
-    def projected(self) -> Array:
-        """(n, m, q + 1) columns and residual with the part that first states absorb taken away."""
-        return np.asarray(self.columns - self.by_start @ self.eliminated().solved)
-
 
 def bounded_step(hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
     """(q,) the step of a Levenberg-Marquardt method within limits.

@@ -42,7 +42,7 @@ def _held(fit: Fit, values: Mapping[str, float]) -> Fit:
     free = {name: c for name, c in fit.problem.free.items() if name not in values}
     problem = replace(fit.problem, model=with_coefficients(fit.problem.model, values), free=free)
     known = {name: value for name, value in fit.unknowns.values.items() if name in free}
-    return Fit.at(problem, replace(fit.unknowns, values=known), fit.noise, fit.steps)
+    return Fit.at(problem, replace(fit.unknowns, values=known), fit.noise)
 
 
 def model_of(sets: Sets, names: frozenset[str], first: Fit) -> Weighed:
@@ -87,7 +87,7 @@ def without_at_shapes(model: Weighed, gone: Sequence[Hypothesis], first: Fit) ->
     left = dict(fit.problem.model.named_parameters())
     shapes = {name: value for name, value in shapes.items() if name in left}
     problem = replace(fit.problem, free={n: c for n, c in free.items() if n in fit.problem.free or n in shapes})
-    return Fit.at(problem, replace(fit.unknowns, values=fit.unknowns.values | shapes), fit.noise, fit.steps)
+    return Fit.at(problem, replace(fit.unknowns, values=fit.unknowns.values | shapes), fit.noise)
 
 
 def smaller_fit(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:

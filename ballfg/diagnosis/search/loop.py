@@ -7,13 +7,12 @@ from ballfg.diagnosis.evidence.odds import Odds
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping
 from ballfg.diagnosis.result import Candidate, Errors, Finding
 from ballfg.diagnosis.search.changed_fits import with_strengths_of
 from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.ranking import finding_of, ranking
-from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
+from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 
@@ -30,7 +29,6 @@ class Search:
         fit, predictive: the same of the model with the named effects.
         before, judged: prediction errors of both on the judging half.
         whole: the model with the named effects, fitted to the tracks of both halves.
-        named: the effects in order.
         findings, rounds: as in `Diagnosis`.
         odds: probability of each effect that was weighed.
     """
@@ -42,7 +40,6 @@ class Search:
     before: Errors
     judged: Errors
     whole: Fit
-    named: tuple[Hypothesis, ...] = ()
     findings: tuple[Finding, ...] = ()
     rounds: tuple[tuple[Candidate, ...], ...] = ()
     odds: Odds = field(default_factory=Odds)
@@ -114,7 +111,6 @@ class SearchLoop:
             before,
             judged,
             whole,
-            (*stamp_hypotheses(stamps), *final.named),
             (*stamp_findings(first, stamps, whole), *findings),
             tuple(ranking(r.scored, r.refits, r.added, odds) for r in found.rounds),
             odds,
