@@ -41,14 +41,9 @@ def nees(errors: Array, covariances: Array) -> Array:
     return np.asarray(np.einsum("nd,nd->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0]))
 
 
-def chi_square_band(dof: int, count: int, level: float = BAND) -> tuple[float, float]:
-    """The interval that holds the mean of `count` independent chi-square numbers of `dof` degrees with a probability.
-
-    Raises: ValueError: if dof or count is not positive.
-    """
-    if dof < 1 or count < 1:
-        raise ValueError(f"dof and count must be positive; got {dof} and {count}")
-    low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], dof * count) / count
+def chi_square_band(dof: int, count: int) -> tuple[float, float]:
+    """The interval that holds the mean of `count` independent chi-square numbers of `dof` degrees with 99 %."""
+    low, high = chi2.ppf([(1 - BAND) / 2, (1 + BAND) / 2], dof * count) / count
     return float(low), float(high)
 
 

@@ -10,16 +10,10 @@ SHIFT = 1.0  # m, largest shift along x and along y: the size of a table, so tha
 
 
 def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
-    """The rotation and shift of one track in one epoch, independent of batch and process.
-
-    Height is never shifted, since the table has one. Seed, epoch and number of the track are at least 0.
+    """The rotation and shift of one track in one epoch, independent of batch and process. Height is never shifted.
 
     Returns: (angle, shift): () rad, uniform in [-pi, pi); (2,) m along x and y, uniform in [-SHIFT, SHIFT). float64.
-    Raises: ValueError: a negative number.
     """
-    for name, number in (("seed", seed), ("epoch", epoch), ("track", track)):
-        if number < 0:
-            raise ValueError(f"{name} must be at least 0; got {number}. Count from 0.")
     draw = np.random.default_rng([seed, epoch, track]).uniform(-1.0, 1.0, 3)
     return torch.tensor(math.pi * draw[0], dtype=torch.float64), torch.from_numpy(SHIFT * draw[1:])
 

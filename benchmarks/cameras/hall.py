@@ -233,7 +233,7 @@ HALF_TAPE: Final = 0.005
 """m, half the thickness of the net's tape and cord, which shows from above the net."""
 
 
-def drawn_look(rng: np.random.Generator, ball: Colour = WHITE) -> Look:
+def drawn_look(rng: np.random.Generator) -> Look:
     """A look; red lines lie on dark tables and floors, with dark nets."""
     table = TABLES[rng.integers(len(TABLES))]
     floor, wall = (FLOORS[rng.integers(len(FLOORS))] for _ in range(2))
@@ -241,7 +241,7 @@ def drawn_look(rng: np.random.Generator, ball: Colour = WHITE) -> Look:
     lines = LINES[rng.integers(len(LINES) if dark else 2)]
     barriers = FLOORS[rng.integers(len(FLOORS))] if rng.random() < 0.7 else None
     net = (70, 60, 40) if dark or rng.random() < 0.6 else (150, 150, 150)
-    return Look(table, lines, net, floor, wall, ball, barriers, 0.01, rng.uniform(*HALF_MIDDLE), HALF_TAPE)
+    return Look(table, lines, net, floor, wall, WHITE, barriers, 0.01, rng.uniform(*HALF_MIDDLE), HALF_TAPE)
 
 
 def judges(rng: np.random.Generator) -> list[tuple[Array, Colour]]:

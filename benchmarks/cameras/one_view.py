@@ -125,9 +125,8 @@ def calibrated(view: SightedDataset, names: Sequence[str]) -> Estimator:
 
 def _judged(estimate: Estimate, track: Track, whole: Estimate, duration: float) -> Stroke:
     """One estimate against the measured track, and its first bounce against that of the track's estimate."""
-    times = estimate.times - estimate.times[0]
-    true = np.stack([np.interp(times, track.seconds, p) for p in track.positions.T], axis=1)
-    error, late, apart = estimate.states[:, :3] - true, np.nan, np.nan
+    error = estimate.states[:, :3] - _at(track, estimate.times - estimate.times[0])
+    late = apart = np.nan
     if estimate.contacts and whole.contacts:
         one, other = estimate.contacts[0].time - estimate.times[0], whole.contacts[0].time
         late = abs(one - other)

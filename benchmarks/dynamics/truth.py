@@ -63,8 +63,6 @@ _SPLIT_STREAM: Final = 6  # Keeps the draw of the split apart from other draws o
 
 def synthetic_task(seed: int, tracks: int = TRACKS) -> Task:
     """Synthetic tracks with their truth; the seed decides launches, noise and split."""
-    if tracks < 2:
-        raise ValueError(f"tracks must be at least 2, one to train on and one to judge by; got {tracks}. Raise it.")
     kind = table_tennis()
     config = SimulationConfig(
         tracks=tracks,

@@ -25,31 +25,25 @@ SPLITS = 200
 """Random splits. The mean of their coverages is then good to 0.3 %; that of a single split has a spread of 3 %."""
 
 
-def split_coverages(
-    predictions: Sequence[TrackPrediction], observe: float, rng: np.random.Generator, splits: int = SPLITS
-) -> Array:
-    """(splits,) share of measured coordinates of one half in the 90 % intervals that the other half calibrates.
+def conformal_coverage(predictions: Sequence[TrackPrediction], observe: float, seed: int) -> Figure | None:
+    """The share of measured coordinates of one half in the 90 % intervals that the other half calibrates.
 
-    Args: predictions: of tracks that last longer than the observed part.  observe: s.  rng: draws the halves.
+    Mean over random splits, and the range of 95 % of them; None where half of the tracks are too few.
+
+    Args: predictions: of tracks that last longer than the observed part.  observe: s.
     """
-    shares = []
-    for _ in range(splits):
+    if len(predictions) // 2 < FEWEST:
+        return None
+    shares, rng = list[float](), np.random.default_rng([seed, 6])
+    for _ in range(SPLITS):
         order = rng.permutation(len(predictions))
         half = len(order) // 2
         scales = ConformalScales.of((predictions[i] for i in order[:half]), "half", observe)
         scaled = [scales.scaled(predictions[i]) for i in order[half:]]
         held = [inside(one.measured - one.positions, one.sigmas, LEVEL) for one in scaled]
-        shares.append(np.concatenate(held).mean())
-    return np.array(shares)
-
-
-def conformal_coverage(predictions: Sequence[TrackPrediction], observe: float, seed: int) -> Figure | None:
-    """Mean coverage over random splits, and the range of 95 % of them; None where half of the tracks are too few."""
-    if len(predictions) // 2 < FEWEST:
-        return None
-    shares = split_coverages(predictions, observe, np.random.default_rng([seed, 6]))
+        shares.append(float(np.concatenate(held).mean()))
     low, high = np.quantile(shares, [0.025, 0.975])
-    return Figure(float(shares.mean()), float(low), float(high))
+    return Figure(float(np.mean(shares)), float(low), float(high))
 
 
 OBSERVE = 0.25  # s, observed part of each track

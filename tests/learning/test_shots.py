@@ -169,8 +169,3 @@ def test_draws_are_uniform() -> None:
     assert shifts.mean(dim=0).abs().max() < 4 * 2 * SHIFT / math.sqrt(12_000)
     assert float(angles.std()) == pytest.approx(math.pi / math.sqrt(3), rel=0.05)
     assert shifts.abs().max() <= SHIFT
-
-
-def test_negative_numbers_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"epoch must be at least 0; got -1"):
-        augmentation(0, -1, 0)

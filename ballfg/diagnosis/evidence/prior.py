@@ -46,14 +46,12 @@ def centres(hypothesis: Hypothesis, model: AnalyticModel) -> Array:
 
 
 def log_odds(hypotheses: Sequence[Hypothesis], nameless: bool = False) -> float:
-    """Logarithm of the prior odds of a model with these effects to one without any; nameless: and patterns."""
-    chances = [VARIES if isinstance(h, Varying) else _there(h) for h in hypotheses] + [THERE] * nameless
-    return float(sum(np.log(p / (1.0 - p)) for p in chances))
+    """Logarithm of the prior odds of a model with these effects to one without any; nameless: and patterns.
 
-
-def _there(hypothesis: Hypothesis) -> float:
-    """Prior probability of an effect, or of one of those that do exactly the same."""
-    return THERE * (1 + len(TWINS.get(hypothesis.name, ())))
+    An effect counts for all that do exactly the same.
+    """
+    chances = [VARIES if isinstance(h, Varying) else THERE * (1 + len(TWINS.get(h.name, ()))) for h in hypotheses]
+    return float(sum(np.log(p / (1.0 - p)) for p in [*chances, *[THERE] * nameless]))
 
 
 def choice_odds(hypotheses: Sequence[Hypothesis]) -> float:

@@ -104,7 +104,8 @@ def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
     ahead, along = panels[-2:]
     for name, errors, colour in series:
         ahead.plot(*_in_time(errors.paths), "o-", color=colour, label=name)
-        along.plot(np.arange(1, 1 + len(errors.paths)), _by_track(errors.paths), ".", color=colour)
+        by_track = [1e3 * np.sqrt((distances(path) ** 2).mean()) for path in errors.paths]
+        along.plot(np.arange(1, 1 + len(by_track)), by_track, ".", color=colour)
     ahead.set(xlabel="time since the last observed sample, s", ylabel="error, mm", ylim=(0.0, None))
     ahead.set_title("prediction error by time", size=11)
     along.set(xlabel="held-out tracks in their order", ylabel="error, mm", ylim=(0.0, None))
@@ -127,11 +128,6 @@ def _cells(paths: Sequence[PredictedPath], edges: Sequence[Array]) -> Array:
     cell = np.ravel_multi_index([place[inside] for place in places], shape)
     count, total = (np.bincount(cell, weights, np.prod(shape)).reshape(shape) for weights in (None, squares[inside]))
     return np.where(count >= LEAST_SAMPLES, 1e3 * np.sqrt(total / np.maximum(count, 1)), np.nan)
-
-
-def _by_track(paths: Sequence[PredictedPath]) -> Array:
-    """(t,) mm, root mean square error of each track."""
-    return np.array([1e3 * np.sqrt((distances(path) ** 2).mean()) for path in paths])
 
 
 def _in_time(paths: Sequence[PredictedPath]) -> tuple[Array, Array]:

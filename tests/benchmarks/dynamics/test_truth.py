@@ -45,11 +45,6 @@ def test_parts_are_disjoint_and_of_the_papers_size() -> None:
     assert split(717, 0) == (train, validation)
 
 
-def test_a_task_needs_two_tracks() -> None:
-    with pytest.raises(ValueError, match="tracks must be at least 2"):
-        synthetic_task(0, 1)
-
-
 def test_tracks_are_long_enough_and_labelled_with_settings_only(task: Task) -> None:
     for shot in (*task.train, *task.validation):
         assert OBSERVED == shot.observed < len(shot.track) == shot.judged <= MOST_SAMPLES
