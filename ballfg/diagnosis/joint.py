@@ -108,8 +108,8 @@ def diagnose_jointly(
     searched = len(np.unique(halves.search.track))
     tests = in_order(*patterns, predicted_test(search.before, search.judged, searched), *of_labels)
     remarks = [*_of_whom(search.findings), *predicting.errors_by_room(search.declared, search.predictive)]
-    together, of_ball = ", ".join(room.name for room in rooms), _of_a_new_room(search.whole, model)
-    whole = told(search, model, together, of_ball, searched, tests, labels)
+    together, new = ", ".join(room.name for room in rooms), _of_a_new_room(search.whole, model)
+    whole = told(search, model, together, new, searched, tests, labels)
     excluded = tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded)
     return JointDiagnosis(replace(whole, excluded=excluded, remarks=(*remarks, *whole.remarks)), models)
 

@@ -232,7 +232,7 @@ def score(
 def judged(
     problem: Problem,
     made: Sequence[tuple[AnalyticModel, Settings]],
-    names: Sequence[str],
+    names: tuple[str, ...],
     shares: Sequence[float],
     horizon: float,
     watch: Watch,

@@ -259,12 +259,7 @@ def read_checkpoint(folder: Path, problem: Problem) -> tuple[list[Step], list[St
 
 
 def _check_follows(steps: Sequence[Step], problem: Problem, path: Path) -> None:
-    if not _follow(steps, problem):
-        raise ValueError(f"{path}: not a checkpoint (its steps are not those of this run). Start a new run.")
-
-
-def _follow(steps: Sequence[Step], problem: Problem) -> bool:
-    """True if steps fit a problem: numbered from 0, with its coefficients and its tracks."""
+    """Refuses steps that do not fit a problem: they are numbered from 0, with its coefficients and its tracks."""
     size, tracks, judged = len(problem.chosen.names), set(problem.split.fit), len(problem.split.judge)
     for number, step in enumerate(steps):
         rows = [step.mean]
@@ -277,5 +272,4 @@ def _follow(steps: Sequence[Step], problem: Problem) -> bool:
         fit = fit and len(step.spins) == groups and set(step.by_group) <= set(problem.chosen.names)
         fit = fit and all(len(row) == groups for row in step.by_group.values())
         if not fit or step.number != number or (step.moved is None) != (number == 0):
-            return False
-    return True
+            raise ValueError(f"{path}: not a checkpoint (its steps are not those of this run). Start a new run.")
