@@ -14,12 +14,6 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest, LabelCheck
 from ballfg.diagnosis.report.wording import sentence
-from ballfg.diagnosis.residual_tests.counted_stamps import (
-    noise_of_all_frames,
-    of_all_frames,
-    with_all_frames,
-    with_errors_of_counting,
-)
 from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
@@ -37,7 +31,13 @@ from ballfg.diagnosis.search.process_noise import (
     unpopulated_model,
 )
 from ballfg.diagnosis.search.ranking import at_bound, implausible
-from ballfg.diagnosis.search.stamp_effects import as_declared
+from ballfg.diagnosis.search.stamp_effects import (
+    as_declared,
+    noise_of_all_frames,
+    of_all_frames,
+    with_all_frames,
+    with_errors_of_counting,
+)
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Effect

@@ -193,12 +193,8 @@ def _launch() -> Array:
     """(9,) the launcher's first state at the middle velocity level, without spread and spin."""
     kind = table_tennis()
     still = {name: 0.0 for name in ("position_spread", "speed_spread", "aim_spread", "spin_spread")}
-    launcher = kind.launcher.with_fields(still)
-    return np.asarray(
-        launcher.launch(np.array([[0, 0, SPEED_LEVEL]]), kind.surfaces.table_height, np.random.default_rng(0))[
-            0
-        ].numpy()
-    )
+    launcher, middle = kind.launcher.with_fields(still), np.array([[0, 0, SPEED_LEVEL]])
+    return launcher.launch(middle, kind.surfaces.table_height, np.random.default_rng(0))[0].numpy()
 
 
 def _spin(contender: GraphContender, start: Array, settings: dict[str, float]) -> Array:
