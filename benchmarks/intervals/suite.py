@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, prediction_rmse
 from ballfg.benchmarks.metrics import inside
 from ballfg.benchmarks.results import Results
 from ballfg.diagnosis import diagnose
@@ -31,59 +31,24 @@ from ballfg.estimation import (
     predict_tracks,
 )
 from ballfg.estimation.noise.estimate import spread_over
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.progress import progress
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, Track, read_dataset
 
-OBSERVED: Final = 0.25  # s, observed part of a judged track
-HORIZON: Final = 0.3  # s, predicted part
 USUAL: Final = "usual noise"
 OBSERVED_PARTS: Final = "noise from observed parts"
 OTHER_TRACKS: Final = "noise from other tracks"
 METHODS: Final = (USUAL, OBSERVED_PARTS, OTHER_TRACKS)
 
 
-@dataclass(frozen=True)
-class Judged:
-    """Predictions of some tracks against what was measured."""
-
-    errors: Array  # (n, 3) m, of all predicted samples
-    sigmas: Array  # (n, 3) m
-    tracks: Array  # (n,) number of the track of each
-    failed: int  # number of tracks without an estimate
-
-    @property
-    def nis(self) -> Array:
-        """(n,) squared errors in standard deviations, x, y and z added; the median of right ones is 2.37."""
-        return np.asarray(((self.errors / self.sigmas) ** 2).sum(axis=1))
-
-    @property
-    def rmse(self) -> float:
-        """m, median over tracks of the root mean square error."""
-        return float(np.median(self.rmse_by_track()))
-
-    def rmse_by_track(self) -> Array:
-        """(t,) m, root mean square error of each track."""
-        numbers = np.unique(self.tracks)
-        squares = (self.errors**2).sum(axis=1)
-        return np.sqrt([squares[self.tracks == number].mean() for number in numbers])
-
-
 def judge(
-    model: BallModel, surfaces: Surfaces, settings: Settings, tracks: Sequence[Track], jobs: int, first: int = 0
-) -> Judged:
-    """Predictions of tracks, numbered from `first` on; tracks that end before are left out."""
-    errors, sigmas, numbers, failed = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)], 0
+    model: BallModel, surfaces: Surfaces, settings: Settings, tracks: Sequence[Track], jobs: int
+) -> list[TrackPrediction]:
+    """Predictions of tracks; those that end before are left out."""
     smoother = Smoother(model, surfaces, settings)
-    results = predict_tracks(smoother, tracks, len(tracks), OBSERVED, horizon=HORIZON, jobs=jobs)
-    for number, result in enumerate(results, start=first):
-        if result.status is Status.FAILED:
-            failed += 1
-        elif len(result.times):
-            errors.append(result.measured - result.positions)
-            sigmas.append(result.sigmas)
-            numbers.append(np.full(len(result.times), float(number)))
-    return Judged(np.concatenate(errors), np.concatenate(sigmas), np.concatenate(numbers), failed)
+    results = predict_tracks(smoother, tracks, len(tracks), OBSERVE, horizon=HORIZON, jobs=jobs)
+    return [one for one in results if one.status is Status.FAILED or len(one.times)]
 
 
 def judged_both_ways(
@@ -94,29 +59,22 @@ def judged_both_ways(
     tracks: Sequence[Track],
     jobs: int,
     position_known: bool = False,
-) -> Judged:
+) -> list[TrackPrediction]:
     """All tracks judged, each half with noise that knows nothing of its later parts.
 
     Args: method: of `METHODS`.  settings: as usual.  position_known: whether the noise of positions is stated.
     """
-    halves = tracks[0::2], tracks[1::2]
-    parts = []
-    for number, (judged, others) in enumerate((halves, halves[::-1])):
+    halves, made = (tracks[0::2], tracks[1::2]), list[TrackPrediction]()
+    for judged, others in (halves, halves[::-1]):
         shown = {
             USUAL: [],
-            OBSERVED_PARTS: [track.opening(OBSERVED) for track in judged],
+            OBSERVED_PARTS: [track.opening(OBSERVE) for track in judged],
             OTHER_TRACKS: list(others),
         }[method]
         asked = spread_over(shown, len(shown))
         found = estimate_noise(model, surfaces, settings, asked, position_known=position_known, errors=False)
-        own = settings if found is None else found.settings
-        parts.append(judge(model, surfaces, own, judged, jobs, number * len(tracks)))
-    return Judged(
-        np.concatenate([part.errors for part in parts]),
-        np.concatenate([part.sigmas for part in parts]),
-        np.concatenate([part.tracks for part in parts]),
-        sum(part.failed for part in parts),
-    )
+        made += judge(model, surfaces, settings if found is None else found.settings, judged, jobs)
+    return made
 
 
 LEVEL: Final = 0.9
@@ -259,14 +217,27 @@ def planted_config(seed: int, number: int, tracks: int) -> SimulationConfig:
     )
 
 
-def add_judged(results: Results, case: str, method: str, judged: Judged, whole: bool = True) -> None:
+def estimated(judged: Sequence[TrackPrediction]) -> list[TrackPrediction]:
+    """The predictions of tracks with an estimate."""
+    return [one for one in judged if one.status is not Status.FAILED]
+
+
+def median_rmse(judged: Sequence[TrackPrediction]) -> float:
+    """m, median over tracks of the root mean square error."""
+    return float(np.median([prediction_rmse(one) for one in estimated(judged)]))
+
+
+def add_judged(results: Results, case: str, method: str, judged: Sequence[TrackPrediction], whole: bool = True) -> None:
     """Coverage, error and failures; `whole`: coverage by axis and the NIS too."""
-    held = inside(judged.errors, judged.sigmas, LEVEL)
-    add, count = partial(results.add, case, method), len(judged.rmse_by_track())
+    good = estimated(judged)
+    errors = np.concatenate([np.zeros((0, 3)), *(one.measured - one.positions for one in good)])
+    sigmas = np.concatenate([np.zeros((0, 3)), *(one.sigmas for one in good)])
+    held, add, count = inside(errors, sigmas, LEVEL), partial(results.add, case, method), len(good)
     add("coverage_90", "%", 100.0 * float(held.mean()), count)
     if whole:
         for axis, share in zip("xyz", held.mean(axis=0).tolist(), strict=True):
             add(f"coverage_90_{axis}", "%", 100.0 * share, count)
-        add("nis_median", "1", float(np.median(judged.nis)), count)
-    add("prediction_rmse_median", "mm", 1e3 * judged.rmse, count)
-    add("failed", "1", judged.failed, count)
+        nis = ((errors / sigmas) ** 2).sum(axis=1)  # the median of right ones is 2.37
+        add("nis_median", "1", float(np.median(nis)), count)
+    add("prediction_rmse_median", "mm", 1e3 * median_rmse(judged), count)
+    add("failed", "1", len(judged) - count, count)

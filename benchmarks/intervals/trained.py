@@ -11,10 +11,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from ballfg.benchmarks.intervals.suite import OBSERVED, Judged, add_judged, judge, known_surfaces
+from ballfg.benchmarks.estimators.measured import OBSERVE
+from ballfg.benchmarks.intervals.suite import add_judged, estimated, judge, known_surfaces, median_rmse
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import BallModel, load_model, nominal_model
 from ballfg.estimation.configure import fitted_settings
+from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.learning import TrainConfig, run_training
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, read_dataset
@@ -56,8 +58,8 @@ def run_trained(results: Results, folders: Sequence[Path], plan: TrainedPlan, jo
                 judged = _judged(model.requires_grad_(False), dataset, jobs)
                 case = f"{names[pair[0]]} + {names[pair[1]]} -> {names[k]}"
                 add_judged(results, case, TRAINED, judged, whole=False)
-                ratio = judged.rmse / nominal[k].rmse
-                results.add(case, TRAINED, "error_ratio", "1", ratio, len(judged.rmse_by_track()))
+                ratio = median_rmse(judged) / median_rmse(nominal[k])
+                results.add(case, TRAINED, "error_ratio", "1", ratio, len(estimated(judged)))
 
 
 def _config(folders: Sequence[Path], epochs: int, seed: int) -> TrainConfig:
@@ -68,7 +70,7 @@ def _config(folders: Sequence[Path], epochs: int, seed: int) -> TrainConfig:
             "data": [str(folder) for folder in folders],
             "architecture": {"residual": True},
             "launcher": {"labels": ["group"]},
-            "observe": OBSERVED,
+            "observe": OBSERVE,
             "split": {"by": "alternate"},
             "loss": {"horizon": 0.3},
             "optimizer": {"epochs": epochs},
@@ -77,6 +79,6 @@ def _config(folders: Sequence[Path], epochs: int, seed: int) -> TrainConfig:
     )
 
 
-def _judged(model: BallModel, dataset: Dataset, jobs: int) -> Judged:
-    settings = fitted_settings(dataset, model, OBSERVED)
+def _judged(model: BallModel, dataset: Dataset, jobs: int) -> list[TrackPrediction]:
+    settings = fitted_settings(dataset, model, OBSERVE)
     return judge(model, known_surfaces(dataset), settings, list(dataset), jobs)

@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE
 from ballfg.benchmarks.intervals.suite import (
-    HORIZON,
-    OBSERVED,
     PLANTED,
     USUAL,
+    add_judged,
     judge,
     judged_both_ways,
     planted_config,
     simulated_config,
 )
+from ballfg.benchmarks.results import Results
 from ballfg.dynamics import load_model
 from ballfg.estimation import dataset_settings, dataset_surfaces
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
@@ -33,24 +34,28 @@ def shots(tmp_path_factory):
 
 def test_errors_of_the_true_model_are_those_that_it_foretells(shots) -> None:
     model, surfaces, settings, tracks = shots
-    judged = judge(model, surfaces, settings, tracks, 1, first=10)
-    assert judged.failed == 0
-    assert np.unique(judged.tracks).tolist() == [10.0, 11.0, 12.0, 13.0, 14.0, 15.0]
-    first = np.flatnonzero(np.diff(judged.tracks, prepend=0.0))  # of each track: the sample after the observed part
-    assert np.abs(judged.errors[first]).max() < 6.0 * SIGMA
-    assert 0.3 < np.median(judged.nis) < 5.0  # 2.37 of many with the noise of this ball, less with the usual one
-    squares = (judged.errors**2).sum(axis=1)
-    assert judged.rmse_by_track()[2] == pytest.approx(np.sqrt(squares[judged.tracks == 12.0].mean()))
-    for number, track in enumerate(tracks, 10):
+    judged = judge(model, surfaces, settings, tracks, 1)
+    assert [one.name for one in judged] == [track.name for track in tracks]
+    errors = [one.measured - one.positions for one in judged]
+    assert max(np.abs(each[0]).max() for each in errors) < 6.0 * SIGMA  # of the sample after the observed part
+    results = Results("test", 0)
+    add_judged(results, "made", USUAL, judged)
+    assert results.value("made", USUAL, "failed") == 0
+    assert 0.3 < results.value("made", USUAL, "nis_median") < 5.0  # 2.37 of many with the noise of this ball
+    rmse = [1e3 * np.sqrt((each**2).sum(axis=1).mean()) for each in errors]
+    assert results.value("made", USUAL, "prediction_rmse_median") == pytest.approx(np.median(rmse))
+    for one, track in zip(judged, tracks, strict=True):
         since = track.times - track.times[0]
-        assert (judged.tracks == number).sum() == ((since > OBSERVED) & (since <= OBSERVED + HORIZON)).sum()
+        assert len(one.times) == ((since > OBSERVE) & (since <= OBSERVE + HORIZON)).sum()
 
 
 def test_each_track_is_judged_once(shots) -> None:
     model, surfaces, settings, tracks = shots
     both = judged_both_ways(USUAL, model, surfaces, settings, tracks, 1, position_known=True)
-    assert len(np.unique(both.tracks)) == len(tracks)
-    assert len(both.errors) == len(judge(model, surfaces, settings, tracks, 1).errors)
+    assert sorted(one.name for one in both) == sorted(track.name for track in tracks)
+    assert sum(len(one.times) for one in both) == sum(
+        len(one.times) for one in judge(model, surfaces, settings, tracks, 1)
+    )
 
 
 @pytest.mark.parametrize("number", range(2 * len(PLANTED)))
