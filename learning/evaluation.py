@@ -8,19 +8,16 @@ from typing import Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.special import ndtri
 
 from ballfg.arrays import Array
 from ballfg.estimation import Estimator, Status, predict_tracks
+from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.track_prediction import TrackPrediction
 from ballfg.tracks import Track
 
-NINETY = float(ndtri(0.95))  # Standard deviations to each side of a central 90 % interval
-
 OUTLIERS: Final = 0.01  # Share of coordinates that a prediction may miss, as after a hit that nobody foresees
 WIDER: Final = 10.0  # Width of their density, in standard deviations: one missed bounce does not decide a comparison
-
 
 JUDGED: Final = (Status.OK, Status.DEPTH_UNCERTAIN)  # Statuses of estimates whose predictions count
 

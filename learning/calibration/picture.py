@@ -12,11 +12,11 @@ from ballfg.checks import drawn
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.generic import FUNCTIONS, AirCorrection
+from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.files.whole_file import whole_file
 from ballfg.learning.calibration.calibrate import Problem, Step, population_model
 from ballfg.learning.calibration.correction import learned, spans
 from ballfg.learning.calibration.report import Comparison
-from ballfg.learning.evaluation import NINETY
 
 matplotlib.use("Agg")
 

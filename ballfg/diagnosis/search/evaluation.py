@@ -8,7 +8,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem, reachable
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
-from ballfg.diagnosis.fit.problem import Fit, Noise
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.result import Errors, PredictedPath
 from ballfg.dynamics import BallModel, Surfaces
@@ -16,7 +16,7 @@ from ballfg.estimation import Settings, predict_tracks
 from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.track_prediction import TrackPrediction
-from ballfg.prediction.apexes import measured_apexes, path_apex
+from ballfg.prediction.apexes import flight_bounds, measured_apexes, path_apex
 from ballfg.tracks import Track
 
 OBSERVED = 0.4
@@ -49,7 +49,8 @@ def prediction_errors(
             "by; none does. Record longer tracks."
         )
     squares = [((p.positions - p.measured) ** 2).sum(axis=-1) for _, p in pairs]
-    scores = np.concatenate([(p.positions - p.measured) / p.sigmas for _, p in pairs])
+    whitened = [(p.positions - p.measured) / p.sigmas for _, p in pairs]
+    scores = np.concatenate(whitened)
     sigmas = np.concatenate([p.sigmas for _, p in pairs])
     apexes = np.concatenate([_apex_distances(t, p) for t, p in pairs])
     return Errors(
@@ -61,7 +62,7 @@ def prediction_errors(
         float((np.abs(scores) < NINETY).mean()),
         float(np.median((scores**2).sum(axis=-1))),
         tuple(_path(t.track, p) for t, p in pairs),
-        error_of_mean([((p.positions - p.measured) / p.sigmas) ** 2 for _, p in pairs]),
+        error_of_mean([own**2 for own in whitened]),
     )
 
 
@@ -84,21 +85,20 @@ def _apex_distances(evaluated: EvaluationTrack, prediction: TrackPrediction) -> 
     """(a,) m between measured and predicted apexes of flights with an unobserved apex."""
     track, end = evaluated.track, float(prediction.times[0])
     points, when = measured_apexes(track.times, track.positions, evaluated.bounces)
-    edges = [float(track.times[0]), *evaluated.bounces.tolist(), float(track.times[-1])]
     found = []
-    for point, time in zip(points, when, strict=True):
+    for point, time, flight in zip(points, when, flight_bounds(track.times, evaluated.bounces), strict=False):
         if np.isfinite(time) and time > end:
-            start = max(e for e in edges if e <= time)
-            stop = min(e for e in edges if e >= time)
-            predicted, _ = path_apex(prediction.times, prediction.positions, start, stop)
+            predicted, _ = path_apex(prediction.times, prediction.positions, *flight)
             found.append(float(np.linalg.norm(predicted - point)))
     return np.array([d for d in found if np.isfinite(d)])
 
 
 def on_others(fitted: Fit, others: Stretches) -> Fit:
-    """The fit of first states to stretches of other tracks, with all else as fitted."""
-    values = fitted.problem.by_stretch(fitted.unknowns.values, others)
-    return _on(fitted, reachable(fitted.problem.model, others, values), fitted.noise)
+    """The fit of new first states to stretches of other tracks, with all else as fitted."""
+    stretches = reachable(fitted.problem.model, others, fitted.problem.by_stretch(fitted.unknowns.values, others))
+    problem = replace(fitted.problem, stretches=stretches, shared=False)
+    unknowns = replace(fitted.unknowns, starts=stretches.starts.numpy().copy())
+    return fit_problem(problem, unknowns, fitted.noise, settle_noise=False)
 
 
 def on_all(fitted: Fit, others: Fit) -> Fit:
@@ -108,10 +108,3 @@ def on_all(fitted: Fit, others: Fit) -> Fit:
     starts = np.concatenate((fitted.unknowns.starts, others.unknowns.starts))
     unknowns = replace(fitted.unknowns, starts=starts)
     return fit_problem(replace(fitted.problem, stretches=stretches), unknowns, fitted.noise, settle_noise=False)
-
-
-def _on(fitted: Fit, stretches: Stretches, noise: Noise) -> Fit:
-    """A fit's shared unknowns on other stretches, with new first states."""
-    problem = replace(fitted.problem, stretches=stretches, shared=False)
-    unknowns = replace(fitted.unknowns, starts=stretches.starts.numpy().copy())
-    return fit_problem(problem, unknowns, noise, settle_noise=False)

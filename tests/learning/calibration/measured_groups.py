@@ -26,6 +26,7 @@ from ballfg.benchmarks.dynamics.measured import measured_task
 from ballfg.dynamics import AnalyticModel, BallModel, load_model, nominal_model, save_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Settings, Status, predict_tracks
+from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import (
     CALIBRATED,
@@ -44,7 +45,7 @@ from ballfg.learning.calibration.calibrate import (
 )
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
-from ballfg.learning.evaluation import NINETY, log_density
+from ballfg.learning.evaluation import log_density
 from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
 
