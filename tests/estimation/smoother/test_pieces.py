@@ -15,7 +15,7 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother import smoother as smoother_module
 from ballfg.estimation.smoother.pieces import joining
-from ballfg.estimation.smoother.pieces.joining import joined_minimum
+from ballfg.estimation.smoother.pieces.joining import joined_minimum, share_of
 from ballfg.estimation.smoother.pieces.reduction import Point, Reduction
 from ballfg.estimation.smoother.pieces.section import bounds_of, cut_between, look, part_of
 from ballfg.estimation.smoother.pieces.whole import in_pieces
@@ -178,6 +178,19 @@ def test_sections_follow_one_another_and_are_the_whole(monkeypatch):
     assert np.array_equal(np.concatenate([part.times for part in parts]), track.times)
     assert sum(len(part.contacts) for part in parts) == len(whole.contacts)
     assert sum(len(part.hits) for part in parts) == len(whole.hits)
+
+
+@pytest.mark.parametrize("bend", [1.9, 1.0, 0.6])
+def test_steps_that_lead_back_and_forth_become_shorter(bend):
+    """A step that is 1.9 times as long as it should be in one direction: whole ones would take 130 rounds to 1e-6."""
+    rng = np.random.default_rng(0)
+    true = np.eye(6)[0], rng.normal(size=6)  # directions in which steps are wrong, and right
+    off, before, share = np.outer(np.ones(4), true[0] + 1e-4 * true[1]), None, 1.0
+    for _ in range(40 if bend < 1.0 else 12):
+        step = -off - (bend - 1.0) * np.outer(off @ true[0], true[0])
+        share = share_of(step, step if before is None else before, share)
+        off, before = off + share * step, step
+    assert np.abs(off).max() < 1e-6
 
 
 def test_a_cut_keeps_away_from_what_happens():

@@ -43,6 +43,7 @@ REACH: Final = 128
 """Number of states at either end of a section that follow the end at once."""
 ROUNDS: Final = 30
 """Largest number of Gauss-Newton steps of the whole track; usual are six, the later ones of a few sections."""
+LEAST_SHARE: Final = 0.25  # of a step
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,6 @@ class Told:
     def length(self, step: Point) -> float:
         """Length of a step of the whole section, in posterior standard deviations."""
         return float(np.sqrt(2.0 * self.inner + (self.ends.change(step) ** 2).sum()))
-
-    def moved(self, step: Point) -> Values:
-        """The values after a step of the ends and the coefficients."""
-        return self.values.retract(self.response.steps(step), step.coefficients)
 
     def promised(self, step: Point) -> float:
         """The error after a step of the whole section, predicted by the linear problem."""
@@ -136,7 +133,7 @@ def _search(
     told = list(watched(partial(told_by, smoother), states, "joined, round 1"))
     problem = smoother.problem(states[0].section.track, states[0].section.segmentation)
     priors, anchor = section.prior_rows(problem, states[0].section, told[0].values), told[0].values.coefficients
-    last, share = np.full(len(states), np.inf), np.ones(len(states))
+    last, gone = np.full(len(states), np.inf), dict[int, tuple[Array, float]]()
     for number in range(1, ROUNDS + 1):
         points = [Point.of(one.values) for one in told]
         solved = solve_chain([one.ends for one in told], points, priors, anchor)
@@ -150,9 +147,13 @@ def _search(
         near = (length < tolerance) | (RATE_MARGIN * length * rate < tolerance)
         if near.all() or number == ROUNDS:
             break
-        share = np.where(length > last, 0.5 * share, 1.0)
         moving = np.flatnonzero(~near).tolist()
-        tasks = [section.State(states[k].section, told[k].moved(steps[k].scaled(share[k]))) for k in moving]
+        inside = {k: told[k].response.steps(steps[k]) for k in moving}
+        gone = {k: (step, share_of(step, *gone.get(k, (step, 1.0)))) for k, step in inside.items()}
+        tasks = [
+            section.State(states[k].section, told[k].values.retract(share * step, share * steps[k].coefficients))
+            for k, (step, share) in gone.items()
+        ]
         results = watched(partial(told_by, smoother), tasks, f"joined, round {number + 1}")
         for k, one in zip(moving, results, strict=True):
             told[k] = one
@@ -162,6 +163,19 @@ def _search(
     there = [section.State(state.section, one.values) for state, one in zip(states, told, strict=True)]
     at_kink = Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
     return there, chain, error, Convergence.CONVERGED if near.all() else at_kink, number
+
+
+def share_of(step: Array, before: Array, share: float) -> float:
+    """The share of a step (n, w) to go, after a share of the one before it, or the same one if it is the first.
+
+    A whole step may be too long: where the friction bends, the next one then leads back. The secant of both steps, with
+    all columns alike, says how long it should be (J. Barzilai, J. M. Borwein 1988).
+    """
+    size = np.abs(before).max(axis=0)
+    alike = before / np.where(size > 0.0, size, np.inf) ** 2
+    shortened = float((alike * (before - step)).sum())
+    whole = share * float((alike * before).sum())
+    return float(np.clip(whole / shortened, LEAST_SHARE, 1.0)) if shortened > 0.0 else 1.0
 
 
 def watched(function: Callable[[T], R], parts: Sequence[T], what: str) -> Iterator[R]:

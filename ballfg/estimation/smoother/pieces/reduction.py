@@ -39,10 +39,6 @@ class Point:
         """The step from another point to this one."""
         return Point(self.first - other.first, self.last - other.last, self.coefficients - other.coefficients)
 
-    def scaled(self, share: float) -> "Point":
-        """A share of the step."""
-        return Point(share * self.first, share * self.last, share * self.coefficients)
-
 
 @dataclass(frozen=True)
 class Ends:
