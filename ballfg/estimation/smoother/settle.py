@@ -37,7 +37,7 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, 
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
-    from ballfg.estimation.smoother.second_look.depths import Depths
+    from ballfg.estimation.smoother.second_look.explanations import Depths
 
 ROUGH = 1e-2
 """Posterior standard deviations. Minima of this accuracy show the places of contacts and hits; only the last one is
@@ -281,14 +281,13 @@ def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
     return tuple(sorted(timed, key=lambda c: c.time))
 
 
-def label_let_go(graph: BallGraph, values: Values) -> bool:
-    """True if the spin is so far from its label that the label's loss pulls less with distance."""
+def minimise_with_restart(optimizer: LevenbergMarquardt, graph: BallGraph, start: Values) -> Minimum:
+    """The minimum from a start; where a spin let go of its label, the lower of it and the one by convex losses."""
+    found = optimizer.minimize(graph, start)
     able = [batch for batch in graph.batches if isinstance(batch, LABELS) and batch.loss.convex != batch.loss]
-    return any((np.linalg.norm(batch.linearize(values).residual, axis=-1) > batch.loss.scale).any() for batch in able)
-
-
-def minimise_with_restart(optimizer: LevenbergMarquardt, graph: BallGraph, start: Values, found: Minimum) -> Minimum:
-    """The lower of a given minimum and of the one reached by convex losses on labels."""
+    far = (np.linalg.norm(b.linearize(found.values).residual, axis=-1) > b.loss.scale for b in able)
+    if not any(beyond.any() for beyond in far):  # else the label's loss pulls less with distance
+        return found
     convex = (b.with_loss(b.loss.convex) if isinstance(b, LABELS) else b for b in graph.batches)
     held = optimizer.minimize(BallGraph(tuple(convex)), start)
     again = optimizer.minimize(graph, held.values)

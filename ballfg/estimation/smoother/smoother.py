@@ -38,7 +38,6 @@ from ballfg.estimation.smoother.settle import (
     Earlier,
     Solution,
     initial_states,
-    label_let_go,
     leads_nowhere,
     minimise_with_restart,
     timed_contacts,
@@ -90,16 +89,12 @@ class Smoother(Estimator):
         optimizer: LevenbergMarquardt | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
-        self.optimizer = self._usual_optimizer() if optimizer is None else optimizer
+        if optimizer is None and self.settings.solver == "gtsam":
+            from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt  # a tenth of a second
+
+            optimizer = GtsamLevenbergMarquardt()
+        self.optimizer = LevenbergMarquardt() if optimizer is None else optimizer
         check_instance("optimizer", self.optimizer, LevenbergMarquardt, "Leave it out for the usual one.")
-
-    def _usual_optimizer(self) -> LevenbergMarquardt:
-        """That of the settings' solver."""
-        if self.settings.solver != "gtsam":
-            return LevenbergMarquardt()
-        from ballfg.factors.gtsam_solver import GtsamLevenbergMarquardt  # a tenth of a second, for this solver alone
-
-        return GtsamLevenbergMarquardt()
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True) -> Estimate:
         """The states of a track, one per stamp, with the covariances of the Laplace approximation.
@@ -222,34 +217,28 @@ class Smoother(Estimator):
         """
         rough = replace(self.optimizer, tolerance=max(ROUGH, self.optimizer.tolerance))
         segmentation, before = problem.segmentation, None
-        loose = self._loosened(problem) if earlier is None else None
-        if loose is not None:
-            near = self.settle(loose)
+        label = problem.settings.spin_label(problem.track)
+        starts = (one.loosened(problem.track) for one in problem.observations) if earlier is None else ()
+        loose = next((start for start in starts if start is not None), None)
+        if loose is not None:  # an observation asks for more noise, to be solved first
+            near = self.settle(self.problem(loose, problem.segmentation))
             earlier = Earlier(near.minimum.values)
             segmentation = replace(near.events.segmentation, contacts=near.events.contacts)
         for left in range(MAX_UNSEEN_HITS if self.settings.find_events else 0, -1, -1):
             search = ContactSearch(problem, self.surfaces)
             if earlier is None:
-                label = problem.settings.spin_label(problem.track)
                 states = initial_states(problem.track, segmentation.contacts, segmentation, self.model, label)
-                start = problem.start(states)
-            else:
-                start = earlier.start
+            start = problem.start(states) if earlier is None else earlier.start
             arrangement: tuple[Events, Values] | None = Events(segmentation.contacts, segmentation), start
             while arrangement is not None:
                 events, values = arrangement
                 graph = problem.graph(events)
                 graph = graph if earlier is None else earlier.join(graph)
-                minimum = rough.minimize(graph, values)
-                if label_let_go(graph, minimum.values):
-                    minimum = minimise_with_restart(rough, graph, values, minimum)
+                minimum = minimise_with_restart(rough, graph, values)
                 arrangement = search.after(Solution(events, graph, minimum))
             solution = search.best
             segmentation = solution.events.segmentation
-            if (
-                earlier is None
-                and not spin_start(problem.settings.spin_label(problem.track), problem.settings).measured
-            ):
+            if earlier is None and not spin_start(label, problem.settings).measured:
                 solution = with_other_spins(solution, problem.ball, rough)
             if before is not None and leads_nowhere(solution, before):
                 break
@@ -261,14 +250,6 @@ class Smoother(Estimator):
         if found.convergence is Convergence.CONVERGED and found.distance >= self.optimizer.tolerance:
             found = self.optimizer.minimize(solution.graph, found)
         return replace(solution, minimum=found.bare())
-
-    def _loosened(self, problem: TrackProblem) -> TrackProblem | None:
-        """The problem with more noise in an observation that asks for it, to be solved first."""
-        for observation in problem.observations:
-            loose = observation.loosened(problem.track)
-            if loose is not None:
-                return self.problem(loose, problem.segmentation)
-        return None
 
     def result(self, problem: TrackProblem, solution: Solution, *, begins: bool = True) -> Estimate:
         """The estimate of a track from a solution.
@@ -285,10 +266,10 @@ class Smoother(Estimator):
         if rival is not None:
             estimate = with_other_beginning(estimate, self.explained(*rival), odds)
         for one in others:
-            from ballfg.estimation.smoother.second_look.explanations import with_explanation
+            from ballfg.estimation.smoother.second_look.gaps import with_other_contacts
 
             other = self.explained(one.problem, one.solution)
-            estimate = with_explanation(estimate, other, one.odds, one_view=problem.one_view)
+            estimate = with_other_contacts(estimate, other, one.odds, one_view=problem.one_view)
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
             return problem.judged(estimate)
         estimate = with_hit_at_end(self, problem, with_both_sides(self, problem, estimate))

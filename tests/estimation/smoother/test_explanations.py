@@ -13,8 +13,8 @@ from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.second_look.at_end import log_evidence
-from ballfg.estimation.smoother.second_look.depths import Depths, Held, log_prior_of_size, over_depths
-from ballfg.estimation.smoother.second_look.explanations import OPEN
+from ballfg.estimation.smoother.second_look.explanations import Depths, Held, log_prior_of_size, over_depths
+from ballfg.estimation.smoother.second_look.gaps import OPEN
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import Values
 from ballfg.factors.linear.covariance import Covariances

@@ -16,7 +16,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.smoother.pieces import section
-from ballfg.estimation.smoother.pieces.reduction import Chain, Ends, Point, Reduction, Response, moved_rows, solve_chain
+from ballfg.estimation.smoother.pieces.reduction import Chain, Ends, Point, Reduction, Response, solve_chain
 from ballfg.estimation.smoother.settle import ROUGH
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import AT_KINK, RATE_MARGIN, Convergence, objective
@@ -159,7 +159,8 @@ def _search(
             told[k] = one
         last[moving] = length[moving]
     error = sum(one.promised(step) for one, step in zip(told, steps, strict=True))
-    error += objective([moved_rows(rows, chain.coefficients - anchor) for rows in priors])
+    way = chain.coefficients - anchor
+    error += objective([replace(rows, residual=rows.residual + rows.jacobians[0] @ way) for rows in priors])
     there = [section.State(state.section, one.values) for state, one in zip(states, told, strict=True)]
     at_kink = Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
     return there, chain, error, Convergence.CONVERGED if near.all() else at_kink, number

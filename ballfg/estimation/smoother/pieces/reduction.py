@@ -229,8 +229,3 @@ def solve_chain(ends: Sequence[Ends], points: Sequence[Point], priors: Sequence[
     if step is None:
         return None
     return Chain(states + step.states, anchor + step.coefficients, step.root)
-
-
-def moved_rows(rows: Rows, step: Array) -> Rows:
-    """Factors on the coefficients alone after a step (p,) of these."""
-    return replace(rows, residual=rows.residual + rows.jacobians[0] @ step)

@@ -24,7 +24,7 @@ from ballfg.estimation.sides.monitor import widening
 from ballfg.estimation.smoother.pieces.section import shifted
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.estimation.smoother.second_look.at_end import CERTAIN, Solved, log_evidence
-from ballfg.estimation.smoother.settle import ROUGH, Other, Solution, places_of
+from ballfg.estimation.smoother.settle import ROUGH, Arrangement, Other, Solution, places_of
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.state import Z
 from ballfg.tracks import Track
@@ -42,6 +42,7 @@ QUICK: Final = 20
 UNSURE: Final = (
     "how the ball bounced where samples are missing is not certain: covariances hold what is nearly as probable"
 )
+OPEN: Final = "how the ball bounced is not certain: covariances hold what is nearly as probable"
 LIKELY: Final = 2
 """Largest number of explanations of a gap that are solved on the whole track."""
 PASSES: Final = 3
@@ -49,8 +50,8 @@ PASSES: Final = 3
 APART: Final = -math.log(CERTAIN)
 """nats, by which an explanation is so much less probable than another one that it is left out."""
 
-Key = tuple[tuple[tuple[int, float], ...], tuple[int, ...], tuple[int, ...]]
-"""The places of all contacts, the hits and the qualities of the samples: what tells one explanation from another."""
+Key = tuple[Arrangement, tuple[int, ...]]
+"""The arrangement and the qualities of the samples: what tells one explanation from another."""
 
 
 def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> Solved:
@@ -59,7 +60,9 @@ def bridged(smoother: Smoother, problem: TrackProblem, solution: Solution) -> So
     Args: problem, solution: with the events that the whole track shows.
     Returns: a problem and its solution, whose `others` are nearly as probable.
     """
-    longest, best, solved = _longest_step(problem.track), (problem, solution), dict[Key, Solved]()
+    # beyond this an interval is a gap: longer than those over which the segmentation follows hits
+    longest = max(USUAL.short_gap, MANY_STEPS * float(np.median(np.diff(problem.track.times))))
+    best, solved = (problem, solution), dict[Key, Solved]()
     near = {gap: found for gap in _gaps(*best, longest) if (found := _near(smoother, *best, gap, longest))}
     if not near:
         return best
@@ -92,7 +95,7 @@ def _settled(
     problem, solution = best
     if all(_alike(_events_of(solution), events, gap) for gap in gaps):
         return None
-    key = places_of(events.contacts), tuple(events.hits.tolist()), tuple(events.quality.tolist())
+    key = (places_of(events.contacts), tuple(events.hits.tolist())), tuple(events.quality.tolist())
     if key not in solved:
         other = smoother.problem(problem.track, events)
         other.added += problem.added
@@ -103,11 +106,6 @@ def _settled(
 def _events_of(solution: Solution) -> Segmentation:
     """The events of a solution, its contacts included."""
     return replace(solution.events.segmentation, contacts=solution.events.contacts)
-
-
-def _longest_step(track: Track) -> float:
-    """s, beyond which an interval is a gap: longer than those over which the segmentation follows hits."""
-    return max(USUAL.short_gap, MANY_STEPS * float(np.median(np.diff(track.times))))
 
 
 def _gaps(problem: TrackProblem, solution: Solution, longest: float) -> list[int]:
@@ -282,7 +280,7 @@ def evidence(solved: Solved, whole: float | None = None) -> float:
     return (log_evidence(solution) if whole is None else whole) - price
 
 
-def with_other_contacts(estimate: Estimate, other: Estimate, odds: float, note: str = UNSURE) -> Estimate:
+def with_other_contacts(estimate: Estimate, other: Estimate, odds: float, *, one_view: bool = False) -> Estimate:
     """The estimate with covariances that hold another one's states too, and a note; odds: log, of its own."""
     chance = 1.0 / (1.0 + math.exp(max(odds, 0.0)))
     if not chance > CERTAIN:
@@ -291,5 +289,6 @@ def with_other_contacts(estimate: Estimate, other: Estimate, odds: float, note: 
     for k, near in enumerate(estimate.covariances):
         far, jump = other.covariances[k], other.states[k] - estimate.states[k]
         covariances[k] += widening(near, far, jump, chance)
+    note = OPEN if one_view else UNSURE
     notes = estimate.notes if note in estimate.notes else (*estimate.notes, note)
     return replace(estimate, covariances=covariances, notes=notes)
