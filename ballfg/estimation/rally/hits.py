@@ -29,19 +29,15 @@ MOMENTS: Final = 9
 
 
 @dataclass(frozen=True, eq=False)
-class Ahead:
-    """Where paths may be hit: places (g, m, 3) m and covariances (g, m, 3, 3) at moments of gaps of 1, 2, ... g."""
-
-    places: Array
-    covariances: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Hits:
-    """The hits between strokes; remembers the paths about the ends of each stroke."""
+    """The hits between strokes.
+
+    It remembers where each stroke may be hit after (1) or before (-1) it: places (g, m, 3) m and covariances
+    (g, m, 3, 3) at m moments of gaps of 1, 2, ... g pictures.
+    """
 
     grower: Grower
-    ends: dict[tuple[Stroke, int], Ahead] = field(default_factory=dict)
+    ends: dict[tuple[Stroke, int], tuple[Array, Array]] = field(default_factory=dict)
 
     def between(self, strokes: Sequence[Stroke], later: Sequence[Stroke]) -> Array:
         """(n, m) logarithm of the likelihood that a hit joins a stroke (row) and a later one (column); -inf for none.
@@ -77,10 +73,10 @@ class Hits:
         """Places (u, g, m, 3) m and covariances (u, g, m, 3, 3) of u strokes, and which has each number (k,)."""
         used, which = np.unique(numbers, return_inverse=True)
         every = [self._ahead(strokes[number], way) for number in used.tolist()]
-        places, covariances = (np.stack([getattr(one, name) for one in every]) for name in ("places", "covariances"))
+        places, covariances = (np.stack(part) for part in zip(*every, strict=True))
         return places, covariances, which.astype(np.int64)
 
-    def _ahead(self, stroke: Stroke, way: int) -> Ahead:
+    def _ahead(self, stroke: Stroke, way: int) -> tuple[Array, Array]:
         """The path after (way 1) or before (-1) a stroke, for each gap that a hit may fill, in order of time."""
         if (stroke, way) not in self.ends:
             stamps, count = self.grower.field.stamps, self._widest()
@@ -90,7 +86,7 @@ class Hits:
             earlier, later = (begin, other) if way > 0 else (other, begin)
             moments = np.linspace(earlier, later, MOMENTS, axis=1)
             places, spread = self.grower.places_of(stroke.path, moments.ravel())
-            self.ends[stroke, way] = Ahead(places.reshape(count, -1, 3), spread.reshape(count, -1, 3, 3))
+            self.ends[stroke, way] = places.reshape(count, -1, 3), spread.reshape(count, -1, 3, 3)
         return self.ends[stroke, way]
 
 

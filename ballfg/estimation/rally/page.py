@@ -123,12 +123,6 @@ def _camera_row(row: Mapping[str, Any]) -> list[float]:
     return [float(f"{value:.7g}") for value in values]
 
 
-def _pinhole(row: Mapping[str, Any], size: tuple[int, int]) -> Pinhole:
-    values = _camera_row(row)
-    turn = np.reshape(values[2:11], (3, 3))
-    return Pinhole(turn, -turn.T @ np.array(values[11:14]), values[1], size, values[14])
-
-
 def _candidates(path: Path, motion: Rows, cameras: Mapping[str, Any]) -> list[list[list[float]]]:
     """u, v px in the picture itself, score, and whether a flight has it, of each picture's likeliest candidates."""
     by_frame = dict[tuple[str, float], Rows]()
@@ -140,9 +134,10 @@ def _candidates(path: Path, motion: Rows, cameras: Mapping[str, Any]) -> list[li
         here = sorted(here, key=lambda row: (row["trajectory"] == "", -row["score"]))[:DRAWN]
         seen = cameras[picture["camera"]]
         fixed = Pinhole(seen.rotation, seen.centre, float(seen.matrix[0, 0]), seen.size)
-        pixels = fixed.onto(
-            np.array([(row["u"], row["v"]) for row in here]).reshape(-1, 2), _pinhole(picture, seen.size)
-        )
+        values = _camera_row(picture)
+        turn = np.reshape(values[2:11], (3, 3))
+        own = Pinhole(turn, -turn.T @ np.array(values[11:14]), values[1], seen.size, values[14])
+        pixels = fixed.onto(np.array([(row["u"], row["v"]) for row in here]).reshape(-1, 2), own)
         places = np.round(pixels, 1).tolist()
         found.append([[*at, row["score"], row["trajectory"] != ""] for at, row in zip(places, here, strict=True)])
     return found

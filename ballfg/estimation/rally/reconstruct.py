@@ -10,12 +10,11 @@ from ballfg.arrays import Mask
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.noise.sightings import Noise, settled
-from ballfg.estimation.rally.arcs import arcs
+from ballfg.estimation.rally.arcs import NOISE, arcs
 from ballfg.estimation.rally.choose import rally
-from ballfg.estimation.rally.doubtful import balls, kept_of, shows_bounce
+from ballfg.estimation.rally.doubtful import balls, kept_of
 from ballfg.estimation.rally.field import SEEN, SEEN_RANGE, UNKNOWN, Field, at_court, without_lens
-from ballfg.estimation.rally.joined import joined_estimates
-from ballfg.estimation.rally.moments import Event
+from ballfg.estimation.rally.moments import Event, joined_estimates
 from ballfg.estimation.rally.sequence import Chosen
 from ballfg.estimation.rally.strokes import LEAST, Grower, track_of
 from ballfg.estimation.result import Estimate, Status
@@ -138,7 +137,8 @@ def strokes_of(
         return ShotRally(camera, seen, chosen, (), (), 0.0)
     smoother = Smoother(model, surfaces, Settings.for_measured(model, find_events=False))
     radii, seen = seen.radii, replace(seen, radii=UNSIZED)
-    sure = [] if play else shows_bounce(chosen, field)
+    # a ball's for sure: a bounce shows in the picture, which no parabola explains
+    sure = [not play and bool(one.bounces) and field.off(one.rows, 2) > NOISE for one in chosen.strokes]
     telling = kept_of(chosen, sure) if any(sure) else chosen
     kinked = _kinked(telling, field)
     noise = _noise(smoother, seen, replace(camera, covariance=None, exposure=0.0), telling, kinked)

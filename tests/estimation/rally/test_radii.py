@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.estimation.noise.radii import SHARPEST, UNKNOWN, RadiusNoise, too_large
+from ballfg.estimation.rally.doubtful import SHARPEST, UNKNOWN, RadiusNoise, too_large
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from tests.estimation.observations.sighted_rig import RIG, scene, track_of, world
