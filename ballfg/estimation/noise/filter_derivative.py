@@ -13,8 +13,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
-from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL
-from ballfg.estimation.noise.transition_code import is_something, pull, transpose
+from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, is_something, pull, transpose
 from ballfg.state import STATE_DIM
 
 

@@ -11,7 +11,7 @@ from ballfg.dynamics import nominal_model
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.interval import IntervalMaker
-from ballfg.estimation.online.windows.rows import LinearRows
+from ballfg.estimation.online.windows.linear import LinearRows
 from ballfg.estimation.online.windows.window_filter import WindowFilter, carried_with_bias
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings

@@ -16,8 +16,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
 from ballfg.estimation.online.windows.interval import Interval
-from ballfg.estimation.online.windows.linear import LinearFactors
-from ballfg.estimation.online.windows.rows import LinearRows, write_factor
+from ballfg.estimation.online.windows.linear import LinearFactors, LinearRows, write_factor
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.correlated_noise import BiasFactors, BiasStartFactors

@@ -1,65 +1,19 @@
-"""Linear factors keep the information of removed states and of a tracker's bias."""
+"""Linear factors keep the information of removed states.
 
+The rows of linear factors in a chain are kept once, about zero: a moved state changes only their right side.
+"""
+
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.estimation.settings import Settings
-from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
-from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
-from ballfg.factors.correlated_noise import BIAS_DIM, BiasFactors, BiasStartFactors
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, INDEX, NOTHING, ONE, TWO
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch
+from ballfg.factors.loss import weight_of
 from ballfg.state import STATE_DIM
-
-if TYPE_CHECKING:
-    import gtsam
-
-
-def linear_factor(
-    keys: Sequence[int], blocks: Sequence[Array], right: Array, point: "gtsam.Values | None" = None
-) -> "gtsam.NonlinearFactor":
-    """The factor r = sum A_k (x_k - p_k) - b of one or two states; being linear, it needs no callback from GTSAM.
-
-    Args: blocks: (r, w) each, A_k whitened.  right: (r,) b, whitened.  point: p_k of all states; None: zero.
-    """
-    import gtsam
-
-    parts: list[Any] = [part for pair in zip(keys, blocks, strict=False) for part in pair]
-    parts += [right, gtsam.noiseModel.Unit.Create(len(right))]
-    factor = gtsam.JacobianFactor(*parts)
-    if point is None:
-        point = gtsam.Values()
-        for key, block in zip(keys, blocks, strict=True):
-            point.insert(key, np.zeros(block.shape[1]))
-    return gtsam.LinearContainerFactor(factor, point)
-
-
-def linearized(factor: "gtsam.NonlinearFactor", point: "gtsam.Values") -> tuple[list[int], list[Array], Array]:
-    """A factor about a point, whitened: its keys, a block (r, w) of each, and the right side (r,)."""
-    keys = list(factor.keys())
-    matrix, right = factor.linearize(point).jacobian()
-    ends = np.cumsum([len(point.atVector(key)) for key in keys])
-    return keys, np.split(matrix, ends[:-1], axis=1), right
-
-
-def bias_start(key: int, settings: Settings) -> "gtsam.NonlinearFactor":
-    """The prior of a state's bias, about zero."""
-    return _of_biases(BiasStartFactors(np.array([key - STATE_KEY]), settings.bias_sigmas))
-
-
-def bias_link(key: int, dt: float, settings: Settings) -> "gtsam.NonlinearFactor":
-    """The factor between the biases of two states, dt s apart: the bias decays and is renewed."""
-    before = np.array([key - STATE_KEY - 1])
-    return _of_biases(BiasFactors(before, np.array([dt]), settings.bias_sigmas, settings.memory_time))
-
-
-def _of_biases(batch: BiasStartFactors | BiasFactors) -> "gtsam.NonlinearFactor":
-    """The single factor of a batch, on biases."""
-    keys = [STATE_KEY + int(i) for i in batch.variables[0]]
-    origin = np.zeros((1, STATE_DIM + BIAS_DIM))
-    (residual,), blocks = batch.compute(slice(None), (origin,) * len(keys))
-    return linear_factor(keys, [block[0] for block in blocks], -residual)
 
 
 class LinearFactors(FactorBatch):
@@ -78,21 +32,93 @@ class LinearFactors(FactorBatch):
         self.sees_biases = sees_biases  # type: ignore[misc]  # the class's is that of states alone
         self.points, self.blocks, self.b = tuple(points), tuple(blocks), b
 
-    @classmethod
-    def of_gtsam(cls, factor: "gtsam.NonlinearFactor", values: Values, first: int) -> Self:
-        """A linear factor of iSAM2 at the values of the window, whose first state has the number `first`."""
-        import gtsam
-
-        keys = list(factor.keys())
-        numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in keys]
-        points = [np.array(values.gather(np.array([n]), with_biases=True)) for n in numbers]
-        at = gtsam.Values()
-        for key, point in zip(keys, points, strict=True):
-            at.insert(key, point[0])
-        _, blocks, b = linearized(factor, at)
-        return cls(numbers, points, blocks, b, values.biases is not None)
-
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Residual (1, r) and Jacobians (1, r, d)."""
         parts = [block @ (x - at)[0] for block, x, at in zip(self.blocks, inputs, self.points, strict=True)]
         return (np.sum(parts, axis=0) - self.b)[None], tuple(block[None] for block in self.blocks)
+
+
+class LinearRows:
+    """The rows J x = b of linear factors on a state, the next one and the coefficients, in the columns of a chain.
+
+    Args:
+        batches: of one factor each.  width: w, numbers of a state.  p: number of coefficients.
+        columns: of the chain's rows, (x_i, x_{i+1}, c, 0, b).
+
+    Attributes:
+        rows: (r, columns) whitened.
+        losses: (g, 3) of each batch with a robust loss: first row, end, the loss's number.  scales: (g,) theirs.
+    """
+
+    def __init__(self, batches: Sequence[FactorBatch], width: int, p: int, columns: int) -> None:
+        self.rows, self.width = np.zeros((sum(batch.dim for batch in batches), columns)), width
+        losses, row = list[tuple[int, int, int]](), 0
+        for batch in batches:
+            part = self.rows[row : row + batch.dim]
+            origin = [_zeros(batch, variable, width, p) for variable in batch.variables[0].tolist()]
+            (residual,), blocks = batch.compute(slice(None), tuple(origin))
+            write_factor(batch, blocks, width, part)
+            part[:, -1] = -residual
+            if batch.loss.name != "squared":
+                losses.append((row, row + batch.dim, batch.loss.kind))
+            row += batch.dim
+        self.losses = np.array(losses, dtype=np.int64).reshape(-1, 3)
+        self.scales = np.array([batch.loss.scale for batch in batches if batch.loss.name != "squared"])
+
+    @property
+    def dim(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    def write(self, state: Array, after: Array, coefficients: Array, rows: Array) -> None:
+        """Writes the rows about other points into the first of `rows` (.., columns), weighted by robust losses.
+
+        Args: state, after: (w,) points of the state and the next one.  coefficients: (p,).
+        """
+        _about(self.rows, self.losses, self.scales, self.width, state, after, coefficients, rows)
+
+
+def write_factor(batch: FactorBatch, blocks: Sequence[Array], width: int, rows: Array) -> None:
+    """Writes the Jacobians (1, r, d) of a batch of one factor into the columns of its variables, rows (r, columns)."""
+    place = 0
+    for variable, (block,) in zip(batch.variables[0].tolist(), blocks, strict=True):
+        at = 2 * width if variable == COEFFICIENTS else place
+        rows[:, at : at + block.shape[1]] = block
+        place += width
+
+
+def _zeros(batch: FactorBatch, variable: int, width: int, p: int) -> Array:
+    """(1, d) the origin of a variable as a batch sees it."""
+    return np.zeros((1, p if variable == COEFFICIENTS else width if batch.sees_biases else STATE_DIM))
+
+
+@machine_code(NOTHING(TWO, INDEX, ONE, COUNT, ONE, ONE, ONE, TWO))
+def _about(
+    linear: Array,
+    losses: Index,
+    scales: Array,
+    width: int,
+    state: Array,
+    after: Array,
+    coefficients: Array,
+    rows: Array,
+) -> None:
+    """As `LinearRows.write`."""
+    columns = linear.shape[1]
+    for i in range(len(linear)):
+        right = linear[i, columns - 1]
+        for j in range(columns - 1):
+            rows[i, j] = linear[i, j]
+        for j in range(width):
+            right -= linear[i, j] * state[j] + linear[i, width + j] * after[j]
+        for j in range(len(coefficients)):
+            right -= linear[i, 2 * width + j] * coefficients[j]
+        rows[i, columns - 1] = right
+    for g in range(len(losses)):
+        begin, end, square = losses[g, 0], losses[g, 1], 0.0
+        for i in range(begin, end):
+            square += rows[i, columns - 1] ** 2
+        weight = math.sqrt(weight_of(losses[g, 2], scales[g], square))
+        for i in range(begin, end):
+            for j in range(columns):
+                rows[i, j] *= weight

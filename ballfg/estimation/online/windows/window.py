@@ -11,8 +11,15 @@ import gtsam
 import numpy as np
 
 from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
-from ballfg.estimation.online.windows.isam import eliminating_last, key_list, parameters
-from ballfg.estimation.online.windows.linear import LinearFactors, bias_link, bias_start, linear_factor, linearized
+from ballfg.estimation.online.windows.isam import (
+    bias_link,
+    bias_start,
+    key_list,
+    linear_factor,
+    linearized,
+    parameters,
+    summary_of,
+)
 from ballfg.estimation.online.windows.stream_window import COEFFICIENT_THRESHOLD, Arrival, StreamWindow
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
@@ -31,16 +38,13 @@ class IsamWindow(StreamWindow):
     def _clear(self) -> None:
         """An empty iSAM2 and no states."""
         super()._clear()
-        self.isam = self._new_isam()
+        self.isam = gtsam.ISAM2(parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
         if not self.first:
             prior = Bridge(coefficient_prior(self._own_means, self._own_sigmas), "row") if self.p else None
             self.shared: dict[int, gtsam.NonlinearFactor] = {} if prior is None else {0: prior.factor(0)}
 
     def _first_is_known(self) -> bool:
         return any(STATE_KEY + self.first in list(factor.keys()) for factor in self.shared.values())
-
-    def _new_isam(self) -> gtsam.ISAM2:
-        return gtsam.ISAM2(parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
 
     def _insert(self, arrivals: Sequence[Arrival]) -> int:
         """Adds new states with their factors to iSAM2, and reads back the solution."""
@@ -107,10 +111,12 @@ class IsamWindow(StreamWindow):
         remove: list[int],
         last: dict[int, int],
         held: Sequence[int] = (),
+        anew: Sequence[int] = (),
     ) -> list[int]:
         """One iSAM2 update; keys in `last` are eliminated after all others, by group; empty: GTSAM's order.
 
-        The linearisation points of the keys in `held` stay, whatever the thresholds say.
+        The linearisation points of the keys in `held` stay, whatever the thresholds say; those in `anew` are eliminated
+        again, moved or not.
 
         By itself GTSAM eliminates the newest states last, but not the coefficients: every state would then depend on
         them from below, and no update would be local.
@@ -124,6 +130,8 @@ class IsamWindow(StreamWindow):
             how.constrainedKeys = groups
         if held:
             how.noRelinKeys = key_list(held)
+        if anew:
+            how.extraReelimKeys = key_list(anew)
         self._result = self.isam.update(graph, values, how)
         return list(self._result.getNewFactorsIndices())
 
@@ -234,7 +242,8 @@ class IsamWindow(StreamWindow):
             below = True
         if below:  # states that stay were eliminated before leaving ones, and GTSAM dropped them as well
             self.isam = whole
-            self.isam.update(gtsam.NonlinearFactorGraph(), gtsam.Values(), eliminating_last(keys[leaving:], keys))
+            last = {key: 2 if key == COEFFICIENT_KEY else 1 for key in keys[leaving:]}
+            self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), [], last, keys, anew=keys)
             made, removed = self.isam.marginalizeLeavesWithIndices(leaves)
         return made, set(removed)
 
@@ -264,7 +273,7 @@ class IsamWindow(StreamWindow):
     def summaries(self) -> list[FactorBatch]:
         """The linear factors from removed states, about the present estimate."""
         values = self.values if self.first else None
-        return [] if values is None else [LinearFactors.of_gtsam(f, values, self.first) for f in self.shared.values()]
+        return [] if values is None else [summary_of(f, values, self.first) for f in self.shared.values()]
 
     def _point(self, count: int) -> gtsam.Values:
         """The linearisation points of the first states of the window and of the coefficients."""

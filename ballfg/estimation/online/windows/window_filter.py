@@ -7,8 +7,7 @@ import numpy as np
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, ONE, REAL, TWO
-from ballfg.estimation.noise.filter_code import innovate, update
-from ballfg.estimation.noise.transition_code import multiply
+from ballfg.estimation.noise.filter_code import innovate, multiply, update
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.settings import Settings
