@@ -2,7 +2,7 @@
 
 import enum
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -258,3 +258,42 @@ class Estimate:
         from ballfg.estimation.picture import picture
 
         return picture(self)
+
+
+def joined(
+    whole: Estimate, times: Array, parts: Iterable[Estimate], status_after: Callable[[Status, Status], Status]
+) -> Estimate:
+    """An estimate over (n,) s with the states and events of consecutive parts; all else is that of `whole`.
+
+    Args: status_after: that of some parts and the next one.
+    """
+    n, p = len(times), whole.cross_covariances.shape[2]
+    states, covariances, cross = np.empty((n, STATE_DIM)), np.empty((n, STATE_DIM, STATE_DIM)), np.empty((n, 9, p))
+    others = np.zeros((n, STATE_DIM, STATE_DIM))  # nearly empty: `np.zeros` takes no memory for the rest
+    innovations, contacts = dict[str, list[Array]](), list[Contact]()
+    hits, quality, begin, status = list[NDArray[np.int64]](), list[NDArray[np.int8]](), 0, Status.OK
+    for part in parts:
+        inside = slice(begin, begin + len(part))
+        states[inside], covariances[inside], cross[inside] = part.states, part.covariances, part.cross_covariances
+        for k in np.flatnonzero(part.other_sides.any(axis=(1, 2))):
+            others[begin + k] = part.other_sides[k]
+        for name, whitened in part.innovations.items():
+            innovations.setdefault(name, []).append(whitened)
+        contacts += [replace(contact, interval=contact.interval + begin) for contact in part.contacts]
+        hits.append(part.hits + begin)
+        quality.append(part.quality)
+        status = status_after(status, part.status) if begin else part.status
+        begin += len(part)
+    return replace(
+        whole,
+        times=times,
+        states=states,
+        covariances=covariances,
+        status=status,
+        innovations={name: np.concatenate(pieces) for name, pieces in innovations.items()},
+        cross_covariances=cross,
+        contacts=tuple(contacts),
+        hits=np.concatenate(hits),
+        quality=np.concatenate(quality),
+        other_sides=others,
+    )

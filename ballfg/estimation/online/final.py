@@ -5,12 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array
 from ballfg.estimation.online.events import EventTracker
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
-from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation.result import Contact
+from ballfg.estimation.result import Estimate, Status, joined
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.settle import Earlier
 from ballfg.estimation.smoother.smoother import Smoother
@@ -58,23 +57,8 @@ class Leaving:
         late = self._minimum(window, events)
         if not self.parts:
             return late
-        parts, contacts, hits, begin = [*self.parts, late], list[Contact](), list[Index](), 0
-        for part in parts:
-            contacts += [replace(contact, interval=contact.interval + begin) for contact in part.contacts]
-            hits.append(part.hits + begin)
-            begin += len(part)
-        return replace(
-            late,
-            times=self.track.times,
-            states=np.concatenate([part.states for part in parts]),
-            covariances=np.concatenate([part.covariances for part in parts]),
-            status=next((part.status for part in parts if part.status is not Status.OK), late.status),
-            other_sides=np.concatenate([part.other_sides for part in parts]),
-            cross_covariances=np.concatenate([part.cross_covariances for part in parts]),
-            contacts=tuple(contacts),
-            hits=np.concatenate(hits).astype(np.int64),
-            quality=np.concatenate([part.quality for part in parts]),
-        )
+        parts = [*self.parts, late]
+        return joined(late, self.track.times, parts, lambda known, own: own if known is Status.OK else known)
 
     def _minimum(self, window: StreamWindow, events: EventTracker) -> Estimate:
         """The estimate of the window's samples, with all that is known from those before it."""

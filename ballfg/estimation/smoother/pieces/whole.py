@@ -7,12 +7,11 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array
 from ballfg.estimation.observations.observation import Unknowns
 from ballfg.estimation.plausible import plausible
-from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.result import Estimate, Status, joined
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.sides.monitor import Shared, widening_near_contacts, widening_near_hits
@@ -57,7 +56,10 @@ class Smoothed:
 def in_pieces(smoother: "Smoother", track: Track, length: int | None = None) -> Estimate | None:
     """The estimate of a long, prepared track; None if pieces cannot be joined: one has no finite explanation."""
     parts = sections(smoother, track, length)
-    return None if parts is None else _assembled(track, parts)
+    if parts is None:
+        return None
+    first = next(parts)
+    return joined(first, track.times, chain((first,), parts), lambda known, own: own if own.failed else known)
 
 
 def sections(smoother: "Smoother", track: Track, length: int | None = None) -> Iterator[Estimate] | None:
@@ -167,39 +169,3 @@ def _section(
     sigma = sample_sigmas(smoother.settings, count, stated)
     estimate = plausible(estimate, measured, sigma, smoother.settings)
     return replace(estimate, covariances=estimate.covariances + others, other_sides=others)
-
-
-def _assembled(track: Track, parts: Iterator[Estimate]) -> Estimate:
-    """One estimate from those of all sections; `other_sides` is nearly empty, and `np.zeros` takes no memory for it."""
-    n, first = len(track), next(parts)
-    p = first.cross_covariances.shape[2]
-    states, covariances = np.empty((n, STATE_DIM)), np.empty((n, STATE_DIM, STATE_DIM))
-    cross, others = np.empty((n, STATE_DIM, p)), np.zeros((n, STATE_DIM, STATE_DIM))
-    innovations: dict[str, list[Array]] = {name: [] for name in first.innovations}
-    contacts, hits, quality, begin = list[Contact](), list[Index](), list[NDArray[np.int8]](), 0
-    status = first.status
-    for part in chain((first,), parts):
-        inside = slice(begin, begin + len(part))
-        states[inside], covariances[inside], cross[inside] = part.states, part.covariances, part.cross_covariances
-        for k in np.flatnonzero(part.other_sides.any(axis=(1, 2))):
-            others[begin + k] = part.other_sides[k]
-        for name, whitened in part.innovations.items():
-            innovations[name].append(whitened)
-        contacts += [replace(contact, interval=contact.interval + begin) for contact in part.contacts]
-        hits.append(part.hits + begin)
-        quality.append(part.quality)
-        status = part.status if part.status.failed else status
-        begin += len(part)
-    return replace(
-        first,
-        status=status,
-        times=track.times,
-        states=states,
-        covariances=covariances,
-        other_sides=others,
-        cross_covariances=cross,
-        innovations={name: np.concatenate(pieces) for name, pieces in innovations.items()},
-        contacts=tuple(contacts),
-        hits=np.concatenate(hits),
-        quality=np.concatenate(quality),
-    )
