@@ -11,8 +11,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.flights.falling import contrasts, scatter
-from ballfg.estimation.flights.labels import FEWEST, SHORTEST, Labels, label_samples
+from ballfg.estimation.flights.labels import FEWEST, SHORTEST, Labels, contrasts, label_samples, scatter
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
 from ballfg.parallel.parts import jobs_here

@@ -12,6 +12,7 @@ from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, ONE, REAL,
 from ballfg.estimation.flights import modes
 from ballfg.estimation.segmentation import bank
 from ballfg.estimation.segmentation.log import chain, compact
+from ballfg.estimation.segmentation.surface_contact import forget
 
 RATE: Final = 1.0  # 1/s. Prior rate of every event
 SHORTEST: Final = 1e-3  # s. Least interval for the price of an event
@@ -91,19 +92,10 @@ def _begin(work: bank.Work, sample: bank.Sample, hands: bool, scene: bank.Record
         row = work.fill[bank.USED]
         work.fill[bank.USED] += 1
         h = work.bank[row]
-        h.surface, h.age, h.score, h.tip = mode, 0, 0.0, bank.NO_EVENT
+        h.score, h.tip = 0.0, bank.NO_EVENT
         speed = scene.velocity_spread if mode == bank.FLYING else modes.HAND_SPEED if mode != modes.STILL else 0.0
         pull = scene.slack if mode == bank.FLYING else modes.PULLS[mode]
-        for axis in range(3):
-            h.shift[axis] = 0.0
-            for i in range(3):
-                h.mean[axis, i] = 0.0
-                for k in range(3):
-                    h.cov[axis, i, k] = 0.0
-            h.mean[axis, 0] = sample.position[axis]
-            h.cov[axis, 0, 0] = scene.outlier_spread**2
-            h.cov[axis, 1, 1] = speed * speed
-            h.cov[axis, 2, 2] = pull * pull
+        forget(h, mode, sample.position, scene.outlier_spread**2, speed, pull)
         if mode == modes.ROLLING:
             h.cov[2, 1, 1], h.cov[2, 2, 2] = modes.SLOPE**2, 0.0
         bank.pass_through(h, work, modes.CHANGE, -1, mode, 0.0)

@@ -3,13 +3,10 @@
 import math
 from typing import Any, Final
 
-import numpy as np
-
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
-from ballfg.estimation.flights.falling import AIR, STILL_AIR
 from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SCENE, Record
-from ballfg.estimation.segmentation.surface_contact import carry
+from ballfg.estimation.segmentation.surface_contact import carry, transform
 
 HANDLED: Final = 1  # Value of `surface` for a ball that a hand moves quickly: throws, catches, pushes
 CARRIED: Final = 2  # For a ball that a hand moves slowly
@@ -23,6 +20,9 @@ STRIKE: Final = 2  # A flying ball is hit, and flies on
 CHANGE: Final = 3  # The mode changes
 SHIFT: Final = 4  # The measurements of a flying ball jump, its velocity stays: the tracker follows something else
 
+STILL_AIR: Final = 0.7  # m/s^2. Spread of the acceleration of a slow flying ball beside gravity and drag
+AIR: Final = 1.25
+"""Its growth, over the ball's own drag: lift of a spinning ball, and drag of another ball than assumed."""
 AIR_MEMORY: Final = 0.5  # s. Time constant of that acceleration
 SHORT: Final = 0.02
 """Time constants up to which a series is exact to 2 % and better than differences of rounded numbers."""
@@ -59,7 +59,7 @@ def move(h: Record, dt: float, scene: Record) -> None:
         _wander(h, dt, PULLS[h.surface], MEMORIES[h.surface])
     elif h.surface == ROLLING:
         for axis in range(3):
-            _transform(h, axis, dt, 0.5 * dt * dt, dt, 1.0)  # constant acceleration
+            transform(h, axis, dt, 0.5 * dt * dt, 1.0, dt, 1.0)  # constant acceleration
         for axis in range(2):
             h.cov[axis, 1, 1] += ROLLING_DRIFT**2 * dt
         h.cov[2, 0, 0] += STIR**2 * dt
@@ -86,24 +86,6 @@ def _relax(h: Record, t: float, scene: Record) -> None:
         h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL, REAL, REAL))
-def _transform(h: Record, axis: int, t: float, half: float, gain: float, memory: float) -> None:
-    """P + t v + half b, v + gain b, memory b; mean and covariance of one axis."""
-    mean, cov = h.mean[axis], h.cov[axis]
-    mean[0] += t * mean[1] + half * mean[2]
-    mean[1] += gain * mean[2]
-    mean[2] *= memory
-    left = np.empty((3, 3))
-    for k in range(3):
-        left[0, k] = cov[0, k] + t * cov[1, k] + half * cov[2, k]
-        left[1, k] = cov[1, k] + gain * cov[2, k]
-        left[2, k] = memory * cov[2, k]
-    for i in range(3):
-        cov[i, 0] = left[i, 0] + t * left[i, 1] + half * left[i, 2]
-        cov[i, 1] = left[i, 1] + gain * left[i, 2]
-        cov[i, 2] = memory * left[i, 2]
-
-
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL, REAL, REAL))
 def _wander(h: Record, t: float, spread: float, tau: float) -> None:
     """A hand for t s: its acceleration forgets itself with a time constant tau s and has a spread m/s^2."""
@@ -113,7 +95,7 @@ def _wander(h: Record, t: float, spread: float, tau: float) -> None:
     pp, pv, pb, vv, vb, bb = _wandered(t / tau)
     scale = spread * spread
     for axis in range(3):
-        _transform(h, axis, t, half, gain, memory)
+        transform(h, axis, t, half, 1.0, gain, memory)
         cov = h.cov[axis]
         cov[0, 0] += scale * tau**4 * pp
         cov[1, 1] += scale * tau**2 * vv

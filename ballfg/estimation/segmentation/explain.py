@@ -12,7 +12,7 @@ from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, ONE, REAL, TWO
 from ballfg.estimation.segmentation import bank
 from ballfg.estimation.segmentation.log import chain, compact, decide
 from ballfg.estimation.segmentation.result import HIT, LEAVE, OUTLIER, REST, RESTART, SHIFT
-from ballfg.estimation.segmentation.surface_contact import Step, advance, lift, may_meet, put_down
+from ballfg.estimation.segmentation.surface_contact import Step, advance, forget, lift, may_meet, put_down
 
 SHORTEST_STEP: Final = 1e-3
 """s. Least interval for the price of an event."""
@@ -34,7 +34,7 @@ def start(
     """
     work.fill[bank.USED] = 1
     held = work.bank
-    _forget(held[0], sample.position, scene.outlier_spread**2, scene)
+    forget(held[0], bank.FLYING, sample.position, scene.outlier_spread**2, scene.velocity_spread, scene.slack)
     held[0].score, held[0].tip = score, tip
     _rested(work, 0, sample, scene, surfaces)
     flying = held[:1].copy()
@@ -53,7 +53,7 @@ def hit(
     h = work.bank[row]
     at = h.mean[:, 0].copy() if dt < scene.short_gap else sample.position
     reach = scene.hit_spread**2 + (scene.velocity_spread * min(dt, scene.short_gap)) ** 2
-    _forget(h, at, reach, scene)
+    forget(h, bank.FLYING, at, reach, scene.velocity_spread, scene.slack)
     h.score -= hit_price(scene.hit_rate, scene.hit_cost, scene.short_gap, dt)
     bank.pass_through(h, work, HIT, sample.number - 1, -1, sample.time)
     _rested(work, row, sample, scene, surfaces)
@@ -97,22 +97,6 @@ def leave(work: bank.Work, predicted: bank.Records, sample: bank.Sample, dt: flo
     lift(h, scene)
     h.score = h.score - _rarity(scene.hit_rate, dt) - scene.leave_cost
     h.age = 0
-
-
-@machine_code(NOTHING(bank.ONE_HYPOTHESIS, ONE, REAL, bank.SCENE))
-def _forget(h: bank.Record, position: Array, variance: float, scene: bank.Record) -> None:
-    """Makes a hypothesis fly at a position (3,) m with a variance m^2, with all else unknown."""
-    h.surface, h.age = bank.FLYING, 0
-    for axis in range(3):
-        h.shift[axis] = 0.0
-        for i in range(3):
-            h.mean[axis, i] = 0.0
-            for k in range(3):
-                h.cov[axis, i, k] = 0.0
-        h.mean[axis, 0] = position[axis]
-        h.cov[axis, 0, 0] = variance
-        h.cov[axis, 1, 1] = scene.velocity_spread**2
-        h.cov[axis, 2, 2] = scene.slack**2
 
 
 @machine_code(NOTHING(bank.WORK, COUNT, bank.SAMPLE, bank.SCENE, bank.SURFACES))

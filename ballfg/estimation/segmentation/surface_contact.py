@@ -6,8 +6,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numba import types
 
+from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, ONE, REAL, several
 from ballfg.dynamics.surfaces import within
 from ballfg.estimation.segmentation import bank
 from ballfg.estimation.segmentation.result import CONTACT, REST
@@ -23,6 +24,37 @@ LANDING_SIGMA: Final = 0.2
 """m/s. Change of the horizontal velocity of a ball that stays down."""
 
 
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, COUNT, REAL, REAL, REAL, REAL, REAL))
+def transform(h: bank.Record, axis: int, way: float, half: float, kept: float, gain: float, memory: float) -> None:
+    """P + way v + half b, kept v + gain b, memory b; mean and covariance of one axis."""
+    mean, cov = h.mean[axis], h.cov[axis]
+    mean[0] = mean[0] + way * mean[1] + half * mean[2]
+    mean[1] = kept * mean[1] + gain * mean[2]
+    mean[2] *= memory
+    for k in range(3):
+        p, v, b = cov[0, k], cov[1, k], cov[2, k]
+        cov[0, k], cov[1, k], cov[2, k] = p + way * v + half * b, kept * v + gain * b, memory * b
+    for i in range(3):
+        p, v, b = cov[i, 0], cov[i, 1], cov[i, 2]
+        cov[i, 0], cov[i, 1], cov[i, 2] = p + way * v + half * b, kept * v + gain * b, memory * b
+
+
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, COUNT, ONE, REAL, REAL, REAL))
+def forget(h: bank.Record, surface: int, position: Array, variance: float, speed: float, slack: float) -> None:
+    """Puts a hypothesis at a position (3,) m with a variance m^2; of velocity and slack only the spreads are known."""
+    h.surface, h.age = surface, 0
+    for axis in range(3):
+        h.shift[axis] = 0.0
+        for i in range(3):
+            h.mean[axis, i] = 0.0
+            for k in range(3):
+                h.cov[axis, i, k] = 0.0
+        h.mean[axis, 0] = position[axis]
+        h.cov[axis, 0, 0] = variance
+        h.cov[axis, 1, 1] = speed * speed
+        h.cov[axis, 2, 2] = slack * slack
+
+
 @machine_code(NOTHING(bank.ONE_HYPOTHESIS, REAL, bank.SCENE))
 def carry(h: bank.Record, t: float, scene: bank.Record) -> None:
     """A hypothesis t s later, without an event: a flying ball flies, a resting one stays down; changes `h`.
@@ -34,19 +66,10 @@ def carry(h: bank.Record, t: float, scene: bank.Record) -> None:
     speed = math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
     loss = min(max(scene.drag * speed * t, -STRONGEST_DRAG), STRONGEST_DRAG)
     a, b = t * (1.0 - 0.5 * loss), 1.0 - loss
-    left = np.empty((3, 3))
     for axis in range(3 if h.surface == bank.FLYING else 2):
+        transform(h, axis, a, half, b, t, 1.0)
         mean, cov = h.mean[axis], h.cov[axis]
-        mean[0] = mean[0] + a * mean[1] + half * mean[2]
-        mean[1] = b * mean[1] + t * mean[2]
-        for k in range(3):
-            left[0, k] = cov[0, k] + a * cov[1, k] + half * cov[2, k]
-            left[1, k] = b * cov[1, k] + t * cov[2, k]
-            left[2, k] = cov[2, k]
         for i in range(3):
-            cov[i, 0] = left[i, 0] + a * left[i, 1] + half * left[i, 2]
-            cov[i, 1] = b * left[i, 1] + t * left[i, 2]
-            cov[i, 2] = left[i, 2]
             for k in range(3):
                 cov[i, k] += step * (scene.drift[0, i, k] + step * (scene.drift[1, i, k] + step * scene.drift[2, i, k]))
         if axis == 2:

@@ -14,8 +14,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.flights.dataset import error_ratios, flies_throughout, flights_of, in_flight, pieces_of
 from ballfg.estimation.flights.decode import decode
 from ballfg.estimation.flights.estimates import estimated
-from ballfg.estimation.flights.falling import falls_throughout, scatter
-from ballfg.estimation.flights.labels import MARGIN, MOST, label_samples
+from ballfg.estimation.flights.labels import MARGIN, MOST, falls_throughout, label_samples, scatter
 from ballfg.estimation.flights.modes import HANDLED, SWAYED, _wandered
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED, Scene

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from ballfg.dynamics import Surfaces
-from ballfg.estimation.segmentation.bank import FLYING, HYPOTHESIS, Scene
+from ballfg.estimation.segmentation.bank import FLYING, HYPOTHESIS
 from ballfg.estimation.segmentation.batch import rests_of
-from ballfg.estimation.segmentation.explain import _forget
-from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Event, EventKind
 from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.estimation.segmentation.surface_contact import forget
 
 HEIGHT = 0.76
 
@@ -38,8 +36,7 @@ def test_a_forgotten_ball_is_at_a_place_and_moves_in_any_way() -> None:
     for name in ("mean", "cov", "shift", "age", "surface"):
         bank[name] = 7.0
     settings = SegmentationSettings()
-    scene = Scene(SegmentationPhysics(), Surfaces(0.0), settings)
-    _forget(bank[0], np.array([1.0, -2.0, 0.5]), 0.04, scene.numbers)
+    forget(bank[0], FLYING, np.array([1.0, -2.0, 0.5]), 0.04, settings.velocity_spread, settings.slack)
     np.testing.assert_array_equal(bank[0]["mean"], [[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
     spread = np.diag([0.04, settings.velocity_spread**2, settings.slack**2])
     np.testing.assert_allclose(bank[0]["cov"], np.stack([spread] * 3), rtol=1e-12)
