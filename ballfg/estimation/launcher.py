@@ -120,11 +120,6 @@ def undirected_spin(spins: SpinPopulation, group: str | None) -> SpinLabel:
     return SpinLabel(mean * (0.0, 0.0, 1.0), np.sqrt([level, level, covariance[2, 2]]), measured=False)
 
 
-def shows_direction(way: NDArray[np.float64], sigma: float) -> bool:
-    """Whether a ball's way (3,) m shows the direction of its launch; sigma: m, of its positions along each axis."""
-    return float(np.hypot(way[0], way[1])) > SHOWN * sigma
-
-
 def launch_velocity(track: Track) -> NDArray[np.float64]:
     """(3,) m/s, mean of a track's first samples."""
     first = slice(0, FIRST_SAMPLES)

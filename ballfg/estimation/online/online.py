@@ -17,11 +17,11 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
-from ballfg.estimation.launcher import FIRST_SAMPLES, SpinLabel, group_spin, shows_direction, undirected_spin
+from ballfg.estimation.launcher import FIRST_SAMPLES, SHOWN, SpinLabel, group_spin, undirected_spin
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
 from ballfg.estimation.online.final import Leaving, unknown
-from ballfg.estimation.online.state import Measurement, OnlineState, Sample, Update, measurements_beside
+from ballfg.estimation.online.state import Measurement, OnlineState, Sample, measurements_beside
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import reach_within, warmed_up
 from ballfg.estimation.online.windows.chain import ChainWindow
@@ -122,7 +122,6 @@ class Online(Estimator):
         self._hit = HitDoubt(self.settings, self.events.settings)
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._leaving: Leaving | None = None  # where someone asks for states that left the window
-        self._counts = np.zeros(2, dtype=np.int64)
         self._origin = StreamOrigin()
 
     def copy(self) -> "Online":
@@ -138,10 +137,9 @@ class Online(Estimator):
         if self.window is not None:
             other.window = self.window.copy(other._samples[: len(self.window)])
         other.events = self.events.copy()
-        other._monitor = None if self._monitor is None else self._monitor.copy()
+        other._monitor = copy.copy(self._monitor)
         other._hit = copy.copy(self._hit)
         other._stream = copy.deepcopy(self._stream)
-        other._counts = self._counts.copy()
         other._origin = copy.copy(self._origin)
         return other
 
@@ -230,21 +228,20 @@ class Online(Estimator):
             if sample.label is None and self.settings.spins is not None:
                 sample.label = self._undirected = undirected_spin(self.settings.spins, self.settings.group)
             self.window = self._new_window(sample)
-        self._counts[:] = 0
         before = self.window.newest_in_order if len(self.window) else None
         self._samples.append(sample)
         status, rebuilt = Status.OK if len(self._samples) > 1 else Status.NO_VELOCITY, False
         try:
-            revised, update = self._take_in(self.window, sample, changed)
+            revised, innovation = self._take_in(self.window, sample, changed)
         except (RuntimeError, ValueError) as error:  # GTSAM's, the bridge's or the model's
             rebuilt, revised = True, len(self._samples) - 1
-            status, update = self._repair(error, status)
+            status, innovation = self._repair(error, status)
         newest = self._samples[-1]
         if status is Status.OK and not newest.motion.linked:  # a long gap before it
             status = Status.NO_VELOCITY
         before = None if rebuilt else before
         contact = self._near_contact(before, newest)
-        state = self._state(update, revised, rebuilt, status, contact)
+        state = self._state(innovation, revised, rebuilt, status, contact)
         return self._in_doubt_of_a_hit(state, None if contact is not None else before, newest)
 
     def _in_doubt_of_a_hit(self, state: OnlineState, before: tuple[Array, Array] | None, sample: Sample) -> OnlineState:
@@ -310,51 +307,48 @@ class Online(Estimator):
     def _join(self, sighting: Measurement) -> OnlineState:
         """Takes in one more sighting of the newest sample."""
         assert self.window is not None
-        self._counts[:] = 0
         self._samples[-1].measurements.append(sighting)
         try:
-            update = self.window.attach(sighting)
+            innovation = self.window.attach(sighting)
         except (RuntimeError, ValueError) as error:
-            status, update = self._repair(error, Status.OK)
-            return self._state(update, 0, True, status, None)
+            status, innovation = self._repair(error, Status.OK)
+            return self._state(innovation, 0, True, status, None)
         assert self._monitor is not None
         contact = self._monitor.update(SampleMeasurement(factors=[sighting.batch]), self._has_bounced)
-        return self._state(update, 0, False, Status.OK, contact)
+        return self._state(innovation, 0, False, Status.OK, contact)
 
-    def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Update]:
-        """Explains, goes back to where the explanation changed, appends, moves contacts, cuts the window."""
+    def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Array]:
+        """Explains, goes back to where the explanation changed, appends, moves contacts, cuts the window.
+
+        Returns: number of samples that were explained anew, and the whitened innovation of the newest one.
+        """
         again = explain(window, self._samples, self.events) if changed else []
         if self.settings.stamp_jitter > 0.0 and sample.measured:
             tell_velocities(window, self._samples)
-        update = self._append(window, *again, sample)
+        innovation = window.append_all([*again, sample])
         moved = move_contacts(window, self._samples, self.events)
         if moved:
-            self._append(window, *moved)
+            window.append_all(moved)
         if window.first == 0 and self._undirected is not None and self._launch_shows():
             assert self.settings.spins is not None
             launch = Track(*path_of(self._samples), name="stream", part=True)
             self._samples[0].label = group_spin(self.settings.spins, launch, self.settings.group)
-            update = window.start_anew(self._samples)
+            innovation = window.start_anew(self._samples)
         if len(window) > 2 * self.lag:
             if self._leaving is not None:
                 self._leaving.take(window, self.events, len(window) - self.lag)
             window.shorten(self.lag)
             self._samples = list(window.samples)
-        return max(len(again), len(moved)), update
+        return max(len(again), len(moved)), innovation
 
     def _launch_shows(self) -> bool:
         """Whether the direction of the launch is known for the first time, or is final with this sample."""
         first, last = self._samples[0], self._samples[-1]
         sigma = float(np.maximum(first.sigma, last.sigma)[:2].max())
-        known = first.label is self._undirected and shows_direction(last.position - first.position, sigma)
-        return known or len(self._samples) == FIRST_SAMPLES
+        way = float(np.hypot(*(last.position - first.position)[:2]))
+        return (first.label is self._undirected and way > SHOWN * sigma) or len(self._samples) == FIRST_SAMPLES
 
-    def _append(self, window: StreamWindow, *samples: Sample) -> Update:
-        update = window.append_all(samples)
-        self._counts += update.evaluated, update.calls
-        return update
-
-    def _repair(self, error: Exception, status: Status) -> tuple[Status, Update]:
+    def _repair(self, error: Exception, status: Status) -> tuple[Status, Array]:
         """Rebuilds the window from its samples; if that fails as well, begins a new one with the newest sample."""
         assert self.window is not None
         try:
@@ -373,7 +367,7 @@ class Online(Estimator):
             raise error from None
 
     def _state(
-        self, update: Update, revised: int, rebuilt: bool, status: Status, contact: ContactState | None
+        self, innovation: Array, revised: int, rebuilt: bool, status: Status, contact: ContactState | None
     ) -> OnlineState:
         """The state at the newest sample."""
         assert self.window is not None
@@ -395,11 +389,9 @@ class Online(Estimator):
             world=self.world,
             name="stream",
             other_side=None if contact is None else contact.other,
-            innovation=update.innovation,
+            innovation=innovation,
             motion=sample.motion,
             revised=revised,
-            evaluated=int(self._counts[0]),
-            calls=int(self._counts[1]),
             rebuilt=rebuilt,
             status=status,
         )

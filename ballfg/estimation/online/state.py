@@ -1,4 +1,4 @@
-"""Measurements and samples of a stream, the record of an update, and the belief after it."""
+"""Measurements and samples of a stream, and the belief after an update."""
 
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
@@ -124,22 +124,6 @@ class Sample:
         return self.stated if self.factor == 1.0 else self.whole * self.factor
 
 
-@dataclass(frozen=True)
-class Update:
-    """The results and costs of one update.
-
-    Attributes:
-        innovation: (dim,) whitened, of the position or of its substitute; NaN without a prediction.
-        evaluated, calls: factors of the motion, including the new one, and torch calls for them.
-        variables: number of states that were eliminated again.
-    """
-
-    innovation: Array
-    evaluated: int
-    calls: int
-    variables: int
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class OnlineState(BallState):
     """The state of the ball after a measurement, with a record of the update.
@@ -148,7 +132,6 @@ class OnlineState(BallState):
         innovation: (3,) the position against its prediction, whitened, (2,) of a sighting; NaN without a prediction.
         motion: how the ball moved since the last observation.
         revised: number of last samples that were retracted and explained anew.
-        evaluated: number of evaluated factors of the motion.  calls: number of torch calls for them.
         rebuilt: True if iSAM2 failed and the window was rebuilt.
         status: OK, or a remedy.
         struck: (9 + p, 9 + p) part of the covariance for the chance that the ball was hit just before, or None.
@@ -157,8 +140,6 @@ class OnlineState(BallState):
     innovation: Array
     motion: Motion
     revised: int
-    evaluated: int
-    calls: int
     rebuilt: bool
     status: Status
     struck: Array | None = None

@@ -1,6 +1,5 @@
 """Finds samples near a contact or hit where a ball may be on either side, the states to report, and covariances."""
 
-import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -244,10 +243,6 @@ class ContactMonitor:
         self._samples = 0
         self._elapsed = 0.0
         self._rejected = 0
-
-    def copy(self) -> "ContactMonitor":
-        """An independent monitor in the same state."""
-        return copy.copy(self)
 
     def reset(self) -> None:
         """Drops the hypotheses, after an event other than flight and bounce."""

@@ -5,7 +5,9 @@ import torch
 from torch import nn
 
 from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
+from ballfg.estimation.online.windows import interval
 from ballfg.estimation.settings import Settings
+from ballfg.factors.batch import merge
 from ballfg.tracks import Track
 
 SIGMA = 0.002
@@ -53,6 +55,21 @@ def settings(**changes):
 
 def feed(online, track):
     return [online.push(t, z) for t, z in zip(track.times.tolist(), track.positions, strict=True)]
+
+
+def fed_and_counted(online, track, monkeypatch):
+    """The states of `feed`, and (n,) how many factors of the motion each push evaluated, (n,) in how many calls."""
+    states, counts = [], np.zeros((len(track), 2), dtype=int)
+
+    def counted(batches):
+        counts[len(states)] += len(batches), 1
+        return merge(batches)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(interval, "merge", counted)
+        for t, z in zip(track.times.tolist(), track.positions, strict=True):
+            states.append(online.push(t, z))
+    return states, *counts.T
 
 
 def distance(states, estimate):

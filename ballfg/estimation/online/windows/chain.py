@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
+from ballfg.estimation.online.state import Measurement, Sample, prepare
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.online.windows.linear import LinearFactors, LinearRows, write_factor
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
@@ -67,7 +67,7 @@ class ChainWindow(StreamWindow):
         other._room(len(self.samples))
         return other
 
-    def _insert(self, arrivals: Sequence[Arrival]) -> int:
+    def _insert(self, arrivals: Sequence[Arrival]) -> None:
         """Takes in new states with their factors, one after another, and solves."""
         first = len(self.samples)
         for arrival in arrivals:
@@ -78,7 +78,9 @@ class ChainWindow(StreamWindow):
             if self.samples:
                 self.intervals.append(arrival.interval)
                 if self.biased:
-                    self._links.append(self._link(sample.time - self.samples[-1].time))
+                    at, dt = np.zeros(1, dtype=np.int64), np.array([sample.time - self.samples[-1].time])
+                    link = BiasFactors(at, dt, self.settings.bias_sigmas, self.settings.memory_time)
+                    self._links.append(LinearRows([link], self.width, self.p, self._columns))
             self.samples.append(sample)
             self._priors.append(own)
             self._rows.append(np.empty((0, self._columns)))
@@ -86,7 +88,7 @@ class ChainWindow(StreamWindow):
             self._linear.append(None)
         self.theta = np.concatenate((self.theta, np.array([arrival.state for arrival in arrivals])))
         self._renew(range(first, len(self.samples)))
-        return self._solve()
+        self._solve()
 
     def retract(self, count: int) -> None:
         """Removes the newest samples, with their states and factors."""
@@ -97,20 +99,21 @@ class ChainWindow(StreamWindow):
         self._answers[-1] = [answer for answer in self._answers[-1] if not isinstance(answer[0], DynamicsFactors)]
         self._renew([count - 1], moved=False)
 
-    def append_all(self, samples: Sequence[Sample]) -> Update:
+    def append_all(self, samples: Sequence[Sample]) -> Array:
         """As the base's, after what was retracted or weighed anew."""
         if self._stale:
             self._solve()
         return super().append_all(samples)
 
-    def attach(self, measurement: Measurement) -> Update:
+    def attach(self, measurement: Measurement) -> Array:
         """Adds one more measurement of the newest sample, which holds it already."""
-        _, count, calls = self._relinearize(None)
+        self._relinearize(None)
         measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
         beside = self.samples[-1].measurements
         prepare(beside, np.tile(self.theta[-1], (len(beside), 1)))
         self._renew([len(self.samples) - 1])
-        return Update(measurement.innovation, count, calls, self._solve())
+        self._solve()
+        return measurement.innovation
 
     def reweigh(self, numbers: list[int]) -> None:
         """Replaces the position factors of some samples of the window, whose noise has changed."""
@@ -156,7 +159,7 @@ class ChainWindow(StreamWindow):
     def _first_is_known(self) -> bool:
         return self._summary is not None and bool(self._summary.blocks[0].any())
 
-    def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
+    def _relinearize(self, new: Interval | None) -> Array:
         """As the base's; the chain's rows of all evaluated factors become stale."""
         before, shared = self.theta, self.coefficient_theta
         found = super()._relinearize(new)
@@ -209,15 +212,8 @@ class ChainWindow(StreamWindow):
             batches.append(coefficient_prior(self._own_means, self._own_sigmas))
         return LinearRows(batches, self.width, self.p, self._columns)
 
-    def _link(self, dt: float) -> LinearRows:
-        """The rows that link the biases of two neighbours, dt s apart."""
-        batch = BiasFactors(
-            np.zeros(1, dtype=np.int64), np.array([dt]), self.settings.bias_sigmas, self.settings.memory_time
-        )
-        return LinearRows([batch], self.width, self.p, self._columns)
-
-    def _solve(self) -> int:
-        """Eliminates from the first state whose rows have changed; returns the number of eliminated states.
+    def _solve(self) -> None:
+        """Eliminates from the first state whose rows have changed.
 
         Raises: RuntimeError: if the system is singular.
         """
@@ -239,7 +235,6 @@ class ChainWindow(StreamWindow):
             raise RuntimeError("the linear system of the window is singular")
         self.delta, self.coefficient_delta = delta, coefficients
         self.newest_covariance = marginal_covariances(self._root(n - 1)).joint(0)
-        return n - begin
 
     def _root(self, first: int) -> Root:
         """The triangle of the states from one on, with the coefficients."""

@@ -81,13 +81,13 @@ class IntervalMaker:
         return Interval(batch, FLIGHT, self._correlation * (scale[:, None] * scale))
 
 
-def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array) -> tuple[list[Array], int]:
+def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array) -> list[Array]:
     """Residuals and Jacobians of k intervals, one torch call for all that share a motion, stored in their bridges.
 
     Args:
         start: (k, 9) states at which they begin; biases may follow these and the next.
         after: (l, 9) states at which the first l of them end; `store` completes the others.  coefficients: (p,).
-    Returns: for each interval the propagated state and its Jacobian side by side, (9, 1 + 9 + p); number of calls.
+    Returns: for each interval the propagated state and its Jacobian side by side, (9, 1 + 9 + p).
     Raises: ValueError: if a value of the model is not finite.
     """
     groups: dict[tuple[type, int, int], list[int]] = {}
@@ -106,7 +106,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
         if ended:
             whole, count = [intervals[k] for k in ended], len(ended)
             _keep(whole, batch.whitening[:count], pieces[:count], start[ended], after[ended], coefficients)
-    return result, len(groups)
+    return result
 
 
 def store(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array, pieces: Array) -> None:
@@ -130,14 +130,3 @@ def _keep(
         checked(intervals[0].batch, slice(None), inputs, residual, blocks)  # says what is not finite
     for row, interval in enumerate(intervals):
         interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))
-
-
-def without_bias(joint: Array, width: int) -> Array:
-    """(9 + p, 9 + p) covariance of a state and the coefficients, from (w + p, w + p) with the bias between them."""
-    if width == STATE_DIM:
-        return joint
-    size = len(joint) - width + STATE_DIM
-    kept, own, shared = np.empty((size, size)), slice(STATE_DIM), slice(width, None)
-    kept[own, own], kept[STATE_DIM:, STATE_DIM:] = joint[own, own], joint[shared, shared]
-    kept[own, STATE_DIM:], kept[STATE_DIM:, own] = joint[own, shared], joint[shared, own]
-    return kept

@@ -55,8 +55,9 @@ class LinearRows:
         losses, row = list[tuple[int, int, int]](), 0
         for batch in batches:
             part = self.rows[row : row + batch.dim]
-            origin = [_zeros(batch, variable, width, p) for variable in batch.variables[0].tolist()]
-            (residual,), blocks = batch.compute(slice(None), tuple(origin))
+            own, seen = width if batch.sees_biases else STATE_DIM, batch.variables[0].tolist()
+            origin = tuple(np.zeros((1, p if variable == COEFFICIENTS else own)) for variable in seen)
+            (residual,), blocks = batch.compute(slice(None), origin)
             write_factor(batch, blocks, width, part)
             part[:, -1] = -residual
             if batch.loss.name != "squared":
@@ -85,11 +86,6 @@ def write_factor(batch: FactorBatch, blocks: Sequence[Array], width: int, rows: 
         at = 2 * width if variable == COEFFICIENTS else place
         rows[:, at : at + block.shape[1]] = block
         place += width
-
-
-def _zeros(batch: FactorBatch, variable: int, width: int, p: int) -> Array:
-    """(1, d) the origin of a variable as a batch sees it."""
-    return np.zeros((1, p if variable == COEFFICIENTS else width if batch.sees_biases else STATE_DIM))
 
 
 @machine_code(NOTHING(TWO, INDEX, ONE, COUNT, ONE, ONE, ONE, TWO))

@@ -16,8 +16,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
-from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store, without_bias
+from ballfg.estimation.online.state import Measurement, Sample, prepare
+from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.windows.window_filter import WindowFilter
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
@@ -102,8 +102,11 @@ class StreamWindow(ABC):
         """Removes the newest samples but `count` of them, at least one, with their states and factors."""
 
     @abstractmethod
-    def attach(self, measurement: Measurement) -> Update:
-        """Adds one more measurement of the newest sample, which holds it already; errors as of `append_all`."""
+    def attach(self, measurement: Measurement) -> Array:
+        """Adds one more measurement of the newest sample, which holds it already.
+
+        Returns and raises: as `append_all`.
+        """
 
     @abstractmethod
     def reweigh(self, numbers: list[int]) -> None:
@@ -121,8 +124,8 @@ class StreamWindow(ABC):
         """The information of removed states on the first state and the coefficients, numbered as in the window."""
 
     @abstractmethod
-    def _insert(self, arrivals: Sequence[Arrival]) -> int:
-        """Takes in new states with their factors, one after another, and solves; number of eliminated states."""
+    def _insert(self, arrivals: Sequence[Arrival]) -> None:
+        """Takes in new states with their factors, one after another, and solves."""
 
     @abstractmethod
     def _first_is_known(self) -> bool:
@@ -136,21 +139,21 @@ class StreamWindow(ABC):
         self.coefficient_theta, self.coefficient_delta = self._own_means.copy(), np.zeros(self.p)
         self.newest_covariance = np.zeros((0, 0))
 
-    def start_anew(self, samples: list[Sample]) -> Update:
-        """Drops a half-updated solution and takes in all samples again; update and errors as of `append_all`."""
+    def start_anew(self, samples: list[Sample]) -> Array:
+        """Drops a half-updated solution and takes in all samples again; innovation and errors as of `append_all`."""
         start, coefficients = self.points[:1], self.coefficients
         self._clear()
         for sample in samples:
             sample.slots, sample.bias_slot = (), None
-        update = Update(np.full(3, np.nan), 0, 0, 0)
+        innovation = np.full(3, np.nan)
         if self.first:
             self.coefficient_theta = coefficients
         if self._first_is_known():
             self._insert([Arrival(samples[0], start[0])])
             samples = samples[1:]
         for sample in samples:
-            update = self.append_all([sample])
-        return update
+            innovation = self.append_all([sample])
+        return innovation
 
     @property
     def points(self) -> Array:
@@ -170,8 +173,8 @@ class StreamWindow(ABC):
     @property
     def newest_belief(self) -> tuple[Array, Array]:
         """Mean (9 + p,) and covariance (9 + p, 9 + p) of the newest state and the coefficients, without the bias."""
-        mean = np.concatenate((self.theta[-1, :STATE_DIM] + self.delta[-1, :STATE_DIM], self.coefficients))
-        return mean, without_bias(self.newest_covariance, self.width)
+        (mean, covariance), own = self.newest_in_order, STATE_DIM + self.p
+        return mean[:own], np.ascontiguousarray(covariance[:own, :own])
 
     @property
     def newest_in_order(self) -> tuple[Array, Array]:
@@ -184,28 +187,28 @@ class StreamWindow(ABC):
         """(p,) the present estimate."""
         return self.coefficient_theta + self.coefficient_delta
 
-    def append_all(self, samples: Sequence[Sample]) -> Update:
+    def append_all(self, samples: Sequence[Sample]) -> Array:
         """Takes in several samples and solves once: those that were retracted when an event changed.
 
         An extended Kalman filter over them gives their linearisation points. If these are too far from the solution,
         the next sample moves them.
 
-        Returns: the last one's update.
+        Returns: (dim,) whitened innovation of the last one's position, or of its substitute; NaN without a prediction.
         Raises: RuntimeError or ValueError: from GTSAM or the model; the window must then be rebuilt.
         """
-        update, begin = Update(np.full(3, np.nan), 0, 0, 0), 0
+        innovation, begin = np.full(3, np.nan), 0
         while begin < len(samples):
             end = begin + 1
             if samples[begin].motion.linked and self.samples:
                 while end < len(samples) and samples[end].motion.linked:
                     end += 1
-                update = self._append_linked(samples[begin:end])
+                innovation = self._append_linked(samples[begin:end])
             else:
-                update = self._append_start(samples[begin])
+                innovation = self._append_start(samples[begin])
             begin = end
-        return update
+        return innovation
 
-    def _append_linked(self, samples: Sequence[Sample]) -> Update:
+    def _append_linked(self, samples: Sequence[Sample]) -> Array:
         """Takes in samples that are linked to the newest one and to each other."""
         mean, covariance = np.concatenate((self.theta[-1] + self.delta[-1], self.coefficients)), self.newest_covariance
         points, intervals, pieces = list[Array](), list[Interval](), list[Array]()
@@ -213,12 +216,11 @@ class StreamWindow(ABC):
             number = self.first + len(self.samples) + len(intervals)
             interval = self.maker.make(number - 1, sample.motion, sample.time - before.time)
             if not points:
-                piece, count, calls = self._relinearize(interval)
+                piece = self._relinearize(interval)
                 points.append(self.theta[-1])
             else:
                 start, end = points[-1][None], np.empty((0, self.width))
-                (piece,), further = evaluate([interval], start, end, self.coefficient_theta)
-                count, calls = count + 1, calls + further
+                (piece,) = evaluate([interval], start, end, self.coefficient_theta)
             mean, covariance, innovation = self._filter.step(
                 piece, points[-1], mean, self.coefficient_theta, covariance, interval, sample
             )
@@ -227,18 +229,19 @@ class StreamWindow(ABC):
             pieces.append(piece)
         states = np.array(points)
         store(intervals, states[:-1], states[1:], self.coefficient_theta, np.array(pieces))
-        variables = self._insert([Arrival(*a) for a in zip(samples, states[1:], intervals, strict=True)])
-        return Update(innovation, count, calls, variables)
+        self._insert([Arrival(*a) for a in zip(samples, states[1:], intervals, strict=True)])
+        return innovation
 
-    def _append_start(self, sample: Sample) -> Update:
+    def _append_start(self, sample: Sample) -> Array:
         """Takes in a sample without a prediction: its state has a wide prior of its own."""
         state = np.zeros(self.width)
         state[POSITION] = sample.position
         if sample.label is not None:
             state[SPIN] = sample.label.spin
         priors = start_priors(0, sample.position, sample.label, self.settings)
-        _, count, calls = self._relinearize(None)
-        return Update(np.full(3, np.nan), count, calls, self._insert([Arrival(sample, state, None, priors)]))
+        self._relinearize(None)
+        self._insert([Arrival(sample, state, None, priors)])
+        return np.full(3, np.nan)
 
     @property
     def _settled(self) -> int:
@@ -246,13 +249,13 @@ class StreamWindow(ABC):
         out_of_reach = 0 if self.reach is None else max(len(self.theta) - self.reach, 0)
         return max(out_of_reach, int(self.first > 0 and self._first_is_known()))
 
-    def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
+    def _relinearize(self, new: Interval | None) -> Array:
         """Moves states whose solution left the thresholds, and evaluates their factors, ahead of iSAM2.
 
         What is known from removed states is linear about the points of the coefficients and of the first state, which
         stay from then on.
 
-        Returns: the new interval's propagation (9, 1 + 9 + p), factors evaluated, torch calls.
+        Returns: the new interval's propagation (9, 1 + 9 + p).
         """
         moved = np.asarray((np.abs(self.delta) > self.threshold).any(axis=1), dtype=bool)
         limit = COEFFICIENT_THRESHOLD * self._own_sigmas
@@ -276,9 +279,8 @@ class StreamWindow(ABC):
             touched.append(new)
             begins.append(len(self.theta) - 1)  # this call computes its end: `store` completes it
         if not touched:
-            return np.empty(0), 0, 0
-        pieces, calls = evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)
-        return pieces[-1], len(touched), calls
+            return np.empty(0)
+        return evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)[-1]
 
     def _position_batch(self, sample: Sample, state: int) -> FactorBatch:
         """The factor of a measured position."""

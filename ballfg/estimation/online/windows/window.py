@@ -10,7 +10,8 @@ from typing import Self
 import gtsam
 import numpy as np
 
-from ballfg.estimation.online.state import Measurement, Sample, Update, prepare
+from ballfg.arrays import Array
+from ballfg.estimation.online.state import Measurement, Sample, prepare
 from ballfg.estimation.online.windows.isam import (
     bias_link,
     bias_start,
@@ -46,7 +47,7 @@ class IsamWindow(StreamWindow):
     def _first_is_known(self) -> bool:
         return any(STATE_KEY + self.first in list(factor.keys()) for factor in self.shared.values())
 
-    def _insert(self, arrivals: Sequence[Arrival]) -> int:
+    def _insert(self, arrivals: Sequence[Arrival]) -> None:
         """Adds new states with their factors to iSAM2, and reads back the solution."""
         graph, values, ends = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
         last = {STATE_KEY + self.first + len(self.samples) + len(arrivals) - 1: 1, COEFFICIENT_KEY: 2}
@@ -80,7 +81,6 @@ class IsamWindow(StreamWindow):
             begin = end + linked
         self.theta = np.concatenate((self.theta, np.array([arrival.state for arrival in arrivals])))
         self._read_back()
-        return int(self._result.getVariablesReeliminated())
 
     def _factors_of(self, arrival: Arrival, key: int) -> list[gtsam.NonlinearFactor]:
         """The factors of a new state: that of its interval first, then its own."""
@@ -132,8 +132,7 @@ class IsamWindow(StreamWindow):
             how.noRelinKeys = key_list(held)
         if anew:
             how.extraReelimKeys = key_list(anew)
-        self._result = self.isam.update(graph, values, how)
-        return list(self._result.getNewFactorsIndices())
+        return list(self.isam.update(graph, values, how).getNewFactorsIndices())
 
     def _fixed_keys(self) -> list[int]:
         """GTSAM's keys of the variables whose points stay, whatever the thresholds say."""
@@ -180,9 +179,9 @@ class IsamWindow(StreamWindow):
         self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {}, self._keys())
         self._read_back()
 
-    def attach(self, measurement: Measurement) -> Update:
+    def attach(self, measurement: Measurement) -> Array:
         """Adds one more measurement of the newest sample, which holds it already."""
-        _, count, calls = self._relinearize(None)
+        self._relinearize(None)
         measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
         prepare([measurement], self.theta[-1:])
         newest = STATE_KEY + self.first + len(self.samples) - 1
@@ -193,7 +192,7 @@ class IsamWindow(StreamWindow):
         sample = self.samples[-1]
         sample.slots = (*sample.slots, *slots)
         self._read_back()
-        return Update(measurement.innovation, count, calls, int(self._result.getVariablesReeliminated()))
+        return measurement.innovation
 
     def reweigh(self, numbers: list[int]) -> None:
         """Replaces the position factors of some samples of the window, whose noise has changed."""
