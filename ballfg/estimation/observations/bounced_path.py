@@ -106,6 +106,16 @@ def shares_of(
     return share, drop
 
 
+def places_of(scene: Scene, tried: Paths, row: int, moments: Array) -> tuple[Array, Array]:
+    """Positions (n, 3) m of one of the paths at moments (n,) s, and their covariances (n, 3, 3) m^2."""
+    own, g = (tried.times[[row]], tried.bounces, tried.drag[[row]]), scene.physics.gravity
+    (share,), (drop,) = shares_of(moments[None], *own, g, lift=scene.lift is not None)
+    positions = share @ tried.vectors[row]
+    positions[:, Z] -= drop
+    joint = tried.covariance[row].reshape(share.shape[1], 3, share.shape[1], 3)
+    return positions, np.asarray(np.einsum("na,aibj,nb->nij", share, joint, share))
+
+
 @lru_cache(maxsize=8)
 def place_prior(surfaces: Surfaces) -> tuple[Array, float]:
     """Mean (3,) m and standard deviation, m, of the place of a ball in play: about the table, if its ends are known."""

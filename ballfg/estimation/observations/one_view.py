@@ -12,11 +12,10 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, possible, shares_of, solved, velocities_of
+from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, places_of, possible, solved, velocities_of
 from ballfg.estimation.observations.ray_path import Path, Rays
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Contact
-from ballfg.state import Z
 
 STEPS: Final = 0.25  # Of the camera's period, between guessed times of a bounce; the smoother finds the time itself
 SPIN: Final = 0.12, 0.12, 0.45
@@ -141,22 +140,10 @@ def _rivals(misfit: Array, times: Array, intervals: Index) -> list[int]:
 
 def _path(scene: Scene, tried: Paths, row: int, moments: Array) -> OneView:
     """One solution at moments (n,) s; misfits widen its sigmas."""
-    times, drag, g = tried.times[[row]], tried.drag[[row]], scene.physics.gravity
-    (share,), (drop,) = shares_of(moments[None], times, tried.bounces, drag, g, lift=scene.lift is not None)
-    positions = share @ tried.vectors[row]
-    positions[:, Z] -= drop
-    joint = tried.covariance[row].reshape(share.shape[1], 3, share.shape[1], 3)
-    variance = np.einsum("ni,iaja,nj->na", share, joint, share)
+    positions, spread = places_of(scene, tried, row, moments)
     misfit = float(tried.misfit[row])
-    spare = max(2 * len(scene.rays.times) - 3 * share.shape[1], 1)
-    bounces = tuple(times[0].tolist()) if tried.bounces else ()
-    return OneView(
-        Path(
-            positions,
-            velocities_of(tried, row, moments, g),
-            np.minimum(np.sqrt(max(misfit / spare, 1.0) * variance), WIDEST),
-        ),
-        bounces,
-        scene.height,
-        misfit / len(scene.rays.times),
-    )
+    wider = max(misfit / max(2 * len(scene.rays.times) - 3 * tried.vectors.shape[1], 1), 1.0)
+    sigmas = np.minimum(np.sqrt(wider * np.diagonal(spread, axis1=1, axis2=2)), WIDEST)
+    velocities = velocities_of(tried, row, moments, scene.physics.gravity)
+    bounces = tuple(tried.times[row].tolist()) if tried.bounces else ()
+    return OneView(Path(positions, velocities, sigmas), bounces, scene.height, misfit / len(scene.rays.times))

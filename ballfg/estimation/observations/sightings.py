@@ -101,14 +101,13 @@ class CameraSightings(Observation):
         """Camera factors; with time offsets among the coefficients where they are unknown."""
         names = [TIME_OFFSET + name for name in self.sightings.cameras]
         columns = np.array([context.columns.get(name, FIXED) for name in names])
-        seen, unknown = self.sightings, columns if (columns != FIXED).any() else None
-        measured, loss = (seen.camera, seen.pixels, seen.covariances), context.settings.sighting_loss
         places = np.array([context.columns.get(f"{CHANGE}{name}.0", FIXED) for name in self.sightings.cameras])
+        seen, bank = self.sightings, _bank(self.cameras)
+        given = (self.state, seen.camera, seen.pixels, seen.covariances, bank, self.delay)
+        rest = (context.settings.sighting_loss, seen.radii, context.model.radius, seen.shifts)
         if (places == FIXED).all():
-            given = (self.state, *measured, _bank(self.cameras), self.delay, unknown, loss)
-            return CameraFactors(*given, seen.radii, context.model.radius, seen.shifts)
-        given = (self.state, *measured, _bank(self.cameras), self.delay, columns, loss)
-        return UncertainCameraFactors(self.cameras, places, *given, seen.radii, context.model.radius, seen.shifts)
+            return CameraFactors(*given, columns if (columns != FIXED).any() else None, *rest)
+        return UncertainCameraFactors(self.cameras, places, *given, columns, *rest)
 
     def unknowns(self, settings: Settings) -> Unknowns:
         """The time offsets that the settings name, s, each counted from that of its camera.

@@ -31,13 +31,6 @@ ROUNDS: Final = 6
 """Of exchanges in a sequence, until nothing improves."""
 
 
-def promising(grower: Grower, flights: Sequence[Stroke]) -> list[Stroke]:
-    """The flights with the highest scores, and among those that a ball in play could have."""
-    # a swaying shoe is no flight, however smooth; an arc through a bounce becomes one with its bounce
-    alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
-    return list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
-
-
 def hypotheses(grower: Grower, flights: Sequence[Stroke], watch: Watch = unwatched) -> list[Stroke]:
     """The strokes that grow from flights, highest scores first; of those with the same candidates only the best."""
     found = dict[tuple[int, ...], Stroke]()
@@ -58,7 +51,10 @@ def rally(grower: Grower, seeds: Sequence[Index], earlier: Sequence[Stroke] = ()
     """
     flights = grower.flights(seeds)
     rated = [grower.flown(stroke.rows, stroke.bounces) for stroke in earlier]
-    begun = promising(grower, flights)
+    # of all, and of those that a ball in play could have: a swaying shoe is no flight, however smooth, and an arc
+    # through a bounce becomes one with its bounce
+    alone = _best_in_each(grower, flights, KEPT, 1, grower.plausible)
+    begun = list({id(one): one for one in (*_best_in_each(grower, flights, KEPT, 1), *alone)}.values())
     known = {_key(stroke): stroke for stroke in (*rated, *hypotheses(grower, begun, watch))}
     done, followed, hits = set[tuple[int, ...]](), {id(flight) for flight in begun}, Hits(grower)
     for _ in range(ROUNDS):

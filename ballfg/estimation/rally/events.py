@@ -105,7 +105,9 @@ def stroke_row(estimate: Estimate, events: list[Event], model: BallModel, net: f
     for axis, number in zip("xyz", range(SPIN.start, SPIN.stop), strict=True):
         row[f"spin_{axis}"] = float(start.state[number])
         row[f"sigma_spin_{axis}"] = float(np.sqrt(start.covariance[number, number]))
-    row["net_clearance"], row["sigma_net_clearance"] = _clearance(estimate, model, net)
+    over = _crossing(model, estimate)  # of the ball's lowest point, where it crosses the net
+    row["net_clearance"] = np.nan if over is None else float(over.state[Z]) - net - model.radius
+    row["sigma_net_clearance"] = np.nan if over is None else float(np.sqrt(over.covariance[Z, Z]))
     place = bounces[-1].place if bounces else np.full(3, np.nan)
     sigmas = bounces[-1].sigmas if bounces else np.full(3, np.nan)
     for i, axis in enumerate("xy"):
@@ -119,14 +121,6 @@ def _speed(name: str, moment: Moment) -> dict[str, float]:
     speed = float(np.linalg.norm(velocity))
     unit = velocity / max(speed, 1e-9)
     return {name: speed, f"sigma_{name}": float(np.sqrt(unit @ moment.covariance[VELOCITY, VELOCITY] @ unit))}
-
-
-def _clearance(estimate: Estimate, model: BallModel, net: float) -> tuple[float, float]:
-    """m, height of the ball's lowest point over the net where it crosses x = 0, and its sigma; NaN if it does not."""
-    at = _crossing(model, estimate)
-    if at is None:
-        return np.nan, np.nan
-    return float(at.state[Z]) - net - model.radius, float(np.sqrt(at.covariance[Z, Z]))
 
 
 def _crossing(model: BallModel, estimate: Estimate, beyond: float = 0.0) -> Moment | None:

@@ -10,6 +10,7 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import FIVE, FOUR, INDEX, NOTHING, ONE
+from ballfg.estimation.observations.bounced_path import places_of
 from ballfg.estimation.rally.strokes import Grower, Stroke
 
 HIT: Final = 3.0
@@ -85,7 +86,7 @@ class Hits:
             begin = np.full(count, stamps[end])
             earlier, later = (begin, other) if way > 0 else (other, begin)
             moments = np.linspace(earlier, later, MOMENTS, axis=1)
-            places, spread = self.grower.places_of(stroke.path, moments.ravel())
+            places, spread = places_of(self.grower.scene, stroke.path, 0, moments.ravel())
             self.ends[stroke, way] = places.reshape(count, -1, 3), spread.reshape(count, -1, 3, 3)
         return self.ends[stroke, way]
 

@@ -15,7 +15,7 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, possible, shares_of, solved
+from ballfg.estimation.observations.bounced_path import LIFT, Paths, Scene, places_of, possible, solved
 from ballfg.estimation.observations.ray_path import Rays
 from ballfg.estimation.observations.rig import with_ends
 from ballfg.estimation.observations.sightings import sighted_track
@@ -23,7 +23,6 @@ from ballfg.estimation.rally.arcs import SLOWEST
 from ballfg.estimation.rally.field import Field, ends_of
 from ballfg.estimation.rally.growth import CANDIDATE, VIEW, all_rated, filled, grown, rated
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
-from ballfg.state import Z
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import written
 from ballfg.tracks.track import Track
@@ -140,15 +139,6 @@ class Grower:
                 found[number] = Stroke(rows[row], (), Paths(numbers[one, 1:2], 0, *own), float(numbers[row, 0]))
         return [found[number] for number in range(len(seeds))]
 
-    def places_of(self, path: Paths, moments: Array) -> tuple[Array, Array]:
-        """Positions (n, 3) m of a single path at moments (n,) s, and their covariances (n, 3, 3) m^2."""
-        gravity = self.scene.physics.gravity
-        (share,), (drop,) = shares_of(moments[None], path.times, path.bounces, path.drag, gravity, lift=True)
-        positions = share @ path.vectors[0]
-        positions[:, Z] -= drop
-        joint = path.covariance.reshape(share.shape[1], 3, share.shape[1], 3)
-        return positions, np.asarray(np.einsum("na,aibj,nb->nij", share, joint, share))
-
     def plausible(self, stroke: Stroke) -> bool:
         """True for a ball in play: its speed, its place at a court with known ends, its bounces, seen on both sides."""
         times = self.scene.rays.times[stroke.rows]
@@ -163,7 +153,7 @@ class Grower:
             return False
         if ends is None:
             return True
-        positions, spread = self.places_of(stroke.path, times)
+        positions, spread = places_of(self.scene, stroke.path, 0, times)
         half, middle = 0.5 * (ends[:, 1] - ends[:, 0]), ends.mean(axis=1)
         table, floor = self.scene.surfaces.table_height, self.scene.surfaces.floor_height
         floor = table - half[1] if floor is None else floor

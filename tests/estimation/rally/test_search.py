@@ -14,6 +14,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 from ballfg.benchmarks.cameras.films import Truth
+from ballfg.estimation.observations.bounced_path import places_of
 from ballfg.estimation.rally import hits as hits_of
 from ballfg.estimation.rally.arcs import Foretold
 from ballfg.estimation.rally.field import SIZE_SIGMA, SIZES, STRAY
@@ -39,7 +40,7 @@ def test_the_path_through_a_balls_candidates_is_where_it_flew(made: tuple[Truth,
         times = grower.scene.rays.times[stroke.rows]
         assert len(times) >= 8
         true = np.array([state[POSITION] for state in map(of.at, times.tolist()) if state is not None])
-        places, spread = grower.places_of(stroke.path, times)
+        places, spread = places_of(grower.scene, stroke.path, 0, times)
         assert np.median(np.linalg.norm(places - true, axis=1)) < 0.12
         assert (np.linalg.eigvalsh(spread) > 0.0).all()
         pixels = shot.cameras[0].project(places)
@@ -120,7 +121,7 @@ def test_a_hit_is_as_likely_as_the_normal_density_of_what_parts_the_paths(
         one, other = strokes[i], strokes[i + 1]
         ends = grower.scene.rays.times[[one.rows[-1], other.rows[0]]]
         moments = np.linspace(*ends, hits_of.MOMENTS)
-        pairs = [grower.places_of(stroke.path, moments) for stroke in (one, other)]
+        pairs = [places_of(grower.scene, stroke.path, 0, moments) for stroke in (one, other)]
         density = [
             multivariate_normal(place, first + second + hits_of.HIT_SIGMA**2 * np.eye(3)).logpdf(other_place)
             for place, first, other_place, second in zip(*pairs[0], *pairs[1], strict=True)
@@ -238,7 +239,7 @@ def test_radii_count_as_much_as_a_balls_are_denser_than_those_of_all_candidates(
     plain, _ = grower_of(found, shot)
     stroke, bounce = true_stroke(of, 0, plain, shot)
     times, camera = plain.scene.rays.times[stroke.rows], plain.camera
-    depth = plain.places_of(stroke.path, times)[0] @ camera.rotation[2] + camera.tvec[2]
+    depth = places_of(plain.scene, stroke.path, 0, times)[0] @ camera.rotation[2] + camera.tvec[2]
     foretold = camera.matrix[0, 0] * plain.scene.physics.radius / depth
     radii = np.exp(rng.uniform(np.log(2.0), np.log(20.0), len(found)))
     radii[stroke.rows] = 1.1 * foretold
