@@ -10,6 +10,7 @@ Index: TypeAlias = NDArray[np.int64]  # Indices and counts
 Mask: TypeAlias = NDArray[np.bool_]  # Selects some of several things
 
 N = TypeVar("N", bound=np.generic)
+MAD_TO_SIGMA = 1.4826  # Standard deviation of a normal variable divided by the median of its absolute value
 
 
 def plain(array: NDArray[N]) -> NDArray[N]:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import MAD_TO_SIGMA, Array
 from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
 from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks import TABLE_TENNIS, Track
@@ -67,7 +67,7 @@ def find_table_extent(tracks: Iterable[Track], table_height: float, radius: floa
     if len(bounces) < LEAST_BOUNCES:
         return None
     contact = float(np.median(bounces[:, Z]))
-    scatter = 1.4826 * float(np.median(np.abs(bounces[:, Z] - contact)))
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(bounces[:, Z] - contact)))
     depth = max(radius, 4.0 * scatter)
     falls = np.concatenate([_falls(*path, contact, depth) for path in paths])
     return _fit(bounces, falls) if len(falls) else None

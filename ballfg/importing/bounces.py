@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import MAD_TO_SIGMA, Array
 from ballfg.dynamics import nominal_model
 from ballfg.importing.choices import Choices, Guess
 from ballfg.importing.frame import SURE, Frame
@@ -138,7 +138,7 @@ def reverses(times: Array, positions: Array) -> bool:
 
 def _scatter(values: Array) -> float:
     """Standard deviation of values (n,), whatever a few of them are."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    return MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values))))
 
 
 def most_swerve_of(ball: Ball) -> float:

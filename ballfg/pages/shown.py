@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import MAD_TO_SIGMA, Array
 from ballfg.checks import did_you_mean, shown
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.pages.given import Given
@@ -18,7 +18,6 @@ from ballfg.tracks.info import TENNIS, DatasetInfo
 MOST_SHOTS = 40  # Number of shots on a page without named ones: a list that is still readable
 MOST_ROWS = 36_000
 """Largest number of samples, states and predictions on a page: about 3 MB beside the drawing library's 5 MB."""
-ROBUST = 1.4826  # Standard deviation of a normal distribution over its median absolute deviation
 NET_HEIGHT = 0.1525  # m, height above the table, and overhang at its sides (ITTF Laws 2.2)
 SMALL_BALL = 0.5 * (TABLE_TENNIS.radius + TENNIS.radius)
 """m. Balls below this radius count as table-tennis balls: their table has the size of the rules, and a net."""
@@ -194,7 +193,7 @@ def _with_noise(given: Given, shots: list[ShownShot]) -> tuple[list[ShownShot], 
     else:
         residuals = np.concatenate([shot.residuals() for shot in shots])
         residuals = residuals[np.isfinite(residuals).all(axis=1)]
-        if not len(residuals) or not (sigma := ROBUST * np.median(np.abs(residuals), axis=0)).all():
+        if not len(residuals) or not (sigma := MAD_TO_SIGMA * np.median(np.abs(residuals), axis=0)).all():
             return shots, ""
         words = "The dataset states no noise: the standard deviations are those of the residuals of the shots shown"
     x, y, z = (1e3 * sigma).tolist()

@@ -26,7 +26,7 @@ from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.plane import Plane
-from ballfg.prediction.propagate import Found, Propagator
+from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VZ
 
 EventFunction = Callable[[Tensor], Tensor]
@@ -34,6 +34,8 @@ EventFunction = Callable[[Tensor], Tensor]
 SearchStep = Callable[[Belief, float, float], tuple["Crossing | None", Belief]]
 """From a belief, the end of a search and the time (s) from which events count to an event and the belief then."""
 
+Search = Callable[..., tuple[float, Belief, Array, Array]]
+"""As `Propagator.search`, of a belief, a horizon and the time from which events count."""
 VALUE_JUMP = 1e-6  # Largest value, in the event's own unit, of a crossing; a larger one jumped through zero in a bounce
 JUST_NOW = 1e-9  # s. Least delay of a new event after the time from which events count
 
@@ -159,7 +161,7 @@ def next_crossing(
 
 
 def _first(
-    belief: Belief, horizon: float, after: float, step: SearchStep, search: Callable[..., Found] | None = None
+    belief: Belief, horizon: float, after: float, step: SearchStep, search: Search | None = None
 ) -> Crossing | None:
     """The first event: found by machine code, `search`, where there is any; by a `step` in torch where that ends."""
     if len(belief) != 1:
@@ -169,12 +171,11 @@ def _first(
     belief = belief.from_zero()
     while (left := end - float(belief.time)) > 0.0:
         if search is not None:
-            found = search(belief, left, earliest - float(belief.time))
-            if found.end == FOUND:
-                return _projected(found.belief, found.gradient, found.rate).later(start)
-            if found.end == NONE:
+            how, belief, gradient, rate = search(belief, left, earliest - float(belief.time))
+            if how == FOUND:
+                return _projected(belief, gradient, rate).later(start)
+            if how == NONE:
                 return None
-            belief = found.belief
         crossing, belief = step(belief, end, earliest)
         if crossing is not None:
             return crossing.later(start)

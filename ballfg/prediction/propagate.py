@@ -66,21 +66,6 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Found:
-    """The result of a search for an event.
-
-    Attributes:
-        end: `events.NONE`, `FOUND`, or `HARD` before a landing, several bounces, or a bounce at a table's edge.
-        belief: at the end.  gradient: (9 + p,) of the event there.  rate: (9 + p,) 1/s, the state's rate of change.
-    """
-
-    end: float
-    belief: Belief
-    gradient: Array
-    rate: Array
-
-
-@dataclass(frozen=True)
 class Propagator:
     """Carries beliefs forward in time.
 
@@ -135,7 +120,7 @@ class Propagator:
         line: tuple[Array, float] | None = None,
         *,
         either_way: bool = False,
-    ) -> Found:
+    ) -> tuple[float, Belief, Array, Array]:
         """Searches for an event on the way of one ball, through flight and plain bounces.
 
         Args:
@@ -143,12 +128,15 @@ class Propagator:
             horizon, earliest: s from the belief's time; only events up to the one and after the other count.
             line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
             either_way: count a rise through the offset as well.
+
+        Returns: `events.NONE`, `FOUND`, or `HARD` before a landing, several bounces, or a bounce at a table's edge; the
+            belief there, (9 + p,) the event's gradient, and (9 + p,) 1/s, the state's rate of change.
         """
         start = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy())
         carrier = self._carrier(belief)
         end, elapsed, course, rate = carrier.find(start, horizon, earliest, line, either_way=either_way)
         (there,) = _beliefs(belief, course, torch.tensor([[elapsed]], dtype=torch.float64))
-        return Found(end, there, carrier.gradient(course.mean[-1, 0], line), rate)
+        return end, there, carrier.gradient(course.mean[-1, 0], line), rate
 
     def _carrier(self, belief: Belief) -> Carrier:
         return Carrier(belief.model, belief.mean.detach().numpy(), self.surfaces, density_of(self.noise))

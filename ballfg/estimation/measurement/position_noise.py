@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ballfg.arrays import Array, Mask, median
+from ballfg.arrays import MAD_TO_SIGMA, Array, Mask, median
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.tracks import Track
 
@@ -30,7 +30,6 @@ LEAST_WINDOWS = 20  # Least number of windows for the scatter of a track
 MOST_SCATTER = 1.75
 """Of the stated noise. Of 300 simulated tracks of each of nine kinds (seed 5; 60 to 200 Hz, with 5 % outliers or
 jittering stamps) at most one in a hundred scatters so much."""
-MAD_TO_SIGMA = 1.4826  # Standard deviation of a normal variable divided by the median of its absolute value
 
 
 def estimate_position_noise(tracks: Iterable[Track]) -> Array:

@@ -12,8 +12,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ballfg.arrays import Array
-from ballfg.estimation.measurement.position_noise import MAD_TO_SIGMA
+from ballfg.arrays import MAD_TO_SIGMA, Array
 from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.rally.sequence import BEGINS, Chosen
 from ballfg.estimation.rally.strokes import track_of

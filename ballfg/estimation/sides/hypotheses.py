@@ -15,6 +15,7 @@ import numpy as np
 
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.edges import height_below
+from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import PreparedMotion
@@ -28,8 +29,6 @@ from ballfg.factors.dynamics import model_width
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
-FAR: Final = 4.5
-"""Standard deviations of the gap beyond which a ball has certainly not touched: one in 300,000."""
 MOST_OFFSET: Final = 0.05
 """m. Upper bound on the rise of a surface by coefficients and slopes."""
 WIDE_VELOCITY: Final = 1.0

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.arrays import Array, Mask
+from ballfg.arrays import MAD_TO_SIGMA, Array, Mask
 from ballfg.vision.arrays import Array32, Image
 
 SHRINK: Final = 4  # pixels of the image per pixel of the small picture for the search
@@ -64,7 +64,7 @@ class Background:
         # larger at noise, at edges under compression, and at moving leaves
         spread = _median([cv2.absdiff(shrunk(image), self.small.astype(np.uint8)) for image in level])
         restless = cv2.dilate(spread.max(axis=2), np.ones((3, 3), dtype=np.uint8))
-        sigma = np.hypot(1.4826 * restless, np.sqrt(self.noise.max()) / SHRINK)
+        sigma = np.hypot(MAD_TO_SIGMA * restless, np.sqrt(self.noise.max()) / SHRINK)
         self.threshold = np.minimum(LEAST_CHANGE + SIGMAS * sigma, 255.0).astype(np.uint8)
         self.gains: Array = np.ones(3)
         self._strip = 0
