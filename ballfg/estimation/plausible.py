@@ -31,7 +31,7 @@ def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings
     covariances = estimate.covariances
     status = Status.FAILED if estimate.status is Status.FAILED else Status.IMPLAUSIBLE
     if wrong.any():
-        states, priors = measured_only(track.positions, sigma, settings)
+        states, priors = measured_only(track.positions, np.maximum(sigma, LEAST_POSITION_SIGMA), settings)
         covariances = np.where(wrong[:, None, None], priors, covariances)
         estimate = replace(
             estimate,
@@ -74,6 +74,6 @@ def measured_only(positions: Array, sigma: Array, settings: Settings) -> tuple[A
     """States (n, 9) from positions (n, 3) m with sigmas (n, 3) m, without velocity, and their (n, 9, 9)."""
     states, spread = np.zeros((len(positions), STATE_DIM)), np.empty((len(positions), STATE_DIM))
     states[:, POSITION] = positions
-    spread[:, POSITION] = np.maximum(sigma, LEAST_POSITION_SIGMA)
+    spread[:, POSITION] = sigma
     spread[:, VELOCITY], spread[:, SPIN] = settings.velocity_prior, settings.spin_prior
     return states, spread[..., None] ** 2 * np.eye(STATE_DIM)

@@ -68,52 +68,84 @@ class FlightsOf(Dataset):
 
 
 @dataclass(frozen=True)
-class InFlight:
-    """The flights of a dataset, and how much of it they are.
+class Contents:
+    """What tracks hold.
 
     Attributes:
-        dataset: the flights; the same dataset where nothing else is in it.
-        tracks, mixed: number of tracks, and of those with something else than flight.
+        pieces: flights by name of the track; None where a track is used as a whole.
         share: of the samples that are flight, 0 to 1.
         smoothing: ratio of slow to fast errors of the positions; 1 if they are white; NaN if unknown.
         others: sentence on samples that are not of the ball; empty without.
         repeated: sentence on positions that are those of the sample before; empty without.
     """
 
-    dataset: Dataset
-    tracks: int
-    mixed: int
+    pieces: "dict[str, list[Piece] | None]"
     share: float
     smoothing: float
     others: str
     repeated: str
+
+    @classmethod
+    def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> "Contents":
+        """Of labelled tracks. Args: whole: True for a track that is used as a whole."""
+        pieces: dict[str, list[Piece] | None] = {}
+        ratios, jumps, samples, flying, lost, again = list[Array](), list[float](), 0, 0, 0, 0
+        for track, labels in labelled:
+            own = pieces[track.name] = None if whole(track, labels) else pieces_of(labels)
+            samples += len(track)
+            lost += int((labels.values == Label.LOST).sum())
+            same = (np.diff(track.positions, axis=0) == 0.0).all(axis=1)
+            again += int((same & (labels.values[1:] == Label.FLIGHT)).sum())
+            flying += len(track) if own is None else int((labels.values == Label.FLIGHT).sum())
+            if len(pieces) <= LOOKED_AT:
+                ratios.append(error_ratios(track, labels))
+                jumps += [float(scatter(track.seconds, track.positions).max())] if len(track) >= FEWEST else []
+        held = np.concatenate(ratios)
+        smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
+        strange = others(lost / samples, float(np.median(jumps or [0.0])))
+        return cls(pieces, flying / samples, smoothing, strange, repeated(again / max(flying, 1)))
+
+
+@dataclass(frozen=True)
+class InFlight:
+    """The flights of a dataset, and how much of it they are.
+
+    Attributes:
+        dataset: the flights; the same dataset where nothing else is in it.
+        mixed: number of tracks with something else than flight.
+        held: in the tracks.
+    """
+
+    dataset: Dataset
+    mixed: int
+    held: Contents
 
     @property
     def lines(self) -> tuple[str, ...]:
         """Doubts, one sentence each."""
         said = list[str]()
         if self.mixed:
-            cut = len(self.dataset) - (self.tracks - self.mixed)
+            rest = len(self.held.pieces) - self.mixed
             said.append(
-                f"{int(100 * self.share)} % of the samples fall like a ball: {cut} flights of {self.mixed} tracks are "
-                f"used, {self.tracks - self.mixed} tracks whole; the rest is held, rolls, rests or is lost"
+                f"{int(100 * self.held.share)} % of the samples fall like a ball: {len(self.dataset) - rest} flights "
+                f"of {self.mixed} tracks are used, {rest} tracks whole; the rest is held, rolls, rests or is lost"
             )
         return (*said, *self.filtered)
 
     @property
     def filtered(self) -> tuple[str, ...]:
         """Sentences on smoothed or repeated positions and on other balls, unless `dataset.yaml` has them."""
-        found = {SMOOTHING: smoothed(self.smoothing)} if self.smoothing > SMOOTHED else {}
-        found |= {OTHER: self.others, REPEATED: self.repeated}
+        found = {SMOOTHING: smoothed(self.held.smoothing)} if self.held.smoothing > SMOOTHED else {}
+        found |= {OTHER: self.held.others, REPEATED: self.held.repeated}
         known = " ".join(self.dataset.info.doubts)
         return tuple(said for sign, said in found.items() if said and sign not in known)
 
     def check(self, where: object, anyway: bool, say: str = ", or say --anyway") -> None:
         """Refuses a dataset that is mostly no flight. Args: say: how to use it anyway. Raises: ValueError."""
-        if self.share < ENOUGH and not anyway:
+        if self.held.share < ENOUGH and not anyway:
             raise ValueError(
-                f"{where} must show flights: only {100 * self.share:.0f} % of its samples fall like a ball. Cut them "
-                f"out with ballfg import --flights, check units and axes{say}."
+                f"{where} must show flights: only {100 * self.held.share:.0f} % of its samples fall like a ball. Cut "
+                f"them out with ballfg import --flights, check units and axes{say}."
             )
 
 
@@ -159,45 +191,7 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
     labels = map_tracks(partial(label_samples, physics=physics, levels=levels), copies, count, jobs_here())
     found = Contents.of(zip(tracks, labels, strict=True), whole)
     mixed = sum(pieces is not None for pieces in found.pieces.values())
-    flights = FlightsOf(dataset, found.pieces) if mixed else dataset
-    return InFlight(flights, len(found.pieces), mixed, found.share, found.smoothing, found.others, found.repeated)
-
-
-@dataclass(frozen=True)
-class Contents:
-    """What tracks hold.
-
-    Attributes:
-        pieces: flights by name of the track; None where a track is used as a whole.
-        share: of the samples that are flight, 0 to 1.
-        smoothing, others, repeated: as of `InFlight`.
-    """
-
-    pieces: "dict[str, list[Piece] | None]"
-    share: float
-    smoothing: float
-    others: str
-    repeated: str
-
-    @classmethod
-    def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> "Contents":
-        """Of labelled tracks. Args: whole: True for a track that is used as a whole."""
-        pieces: dict[str, list[Piece] | None] = {}
-        ratios, jumps, samples, flying, lost, again = list[Array](), list[float](), 0, 0, 0, 0
-        for track, labels in labelled:
-            own = pieces[track.name] = None if whole(track, labels) else pieces_of(labels)
-            samples += len(track)
-            lost += int((labels.values == Label.LOST).sum())
-            same = (np.diff(track.positions, axis=0) == 0.0).all(axis=1)
-            again += int((same & (labels.values[1:] == Label.FLIGHT)).sum())
-            flying += len(track) if own is None else int((labels.values == Label.FLIGHT).sum())
-            if len(pieces) <= LOOKED_AT:
-                ratios.append(error_ratios(track, labels))
-                jumps += [float(scatter(track.seconds, track.positions).max())] if len(track) >= FEWEST else []
-        held = np.concatenate(ratios)
-        smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
-        strange = others(lost / samples, float(np.median(jumps or [0.0])))
-        return cls(pieces, flying / samples, smoothing, strange, repeated(again / max(flying, 1)))
+    return InFlight(FlightsOf(dataset, found.pieces) if mixed else dataset, mixed, found)
 
 
 def error_ratios(track: Track, labels: Labels) -> Array:
@@ -260,15 +254,10 @@ def pieces_of(labels: Labels) -> list[Piece]:
     return found
 
 
-def flights_of(track: Track, physics: SegmentationPhysics, levels: Sequence[float] = ()) -> list[Track]:
-    """The flights of a track: itself, where nothing else is in it.
-
-    Args: physics: of the ball.  levels: m, heights of its centre at which it is known to lie.
-    """
-    labels = label_samples(track, physics, levels)
-    if flies_throughout(labels):
-        return [track]
-    return tracks_of(track, pieces_of(labels))
+def flights_of(track: Track, physics: SegmentationPhysics) -> list[Track]:
+    """The flights of a track: itself, where nothing else is in it. Args: physics: of the ball."""
+    labels = label_samples(track, physics)
+    return [track] if flies_throughout(labels) else tracks_of(track, pieces_of(labels))
 
 
 def names_of(track: str, pieces: Sequence[Piece]) -> list[str]:

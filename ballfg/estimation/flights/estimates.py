@@ -10,10 +10,11 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.flights.labels import SHORTEST, Labels, label_samples
+from ballfg.estimation.plausible import measured_only
 from ballfg.estimation.result import Estimate, Label, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import sample_sigmas
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
 UNKNOWN_SPEED: Final = 5.0  # m/s. Standard deviation of the velocity of a ball that does not fly, per axis
@@ -79,11 +80,8 @@ def _assembled(
 ) -> Estimate:
     """One estimate of a track from those of its parts; coefficients are those of the last part."""
     n, settings = len(track), estimator.settings
-    sigma = np.empty((n, STATE_DIM))
-    sigma[:, POSITION] = sample_sigmas(settings, n, track.sigmas)
-    sigma[:, VELOCITY], sigma[:, SPIN] = UNKNOWN_SPEED, settings.spin_prior
-    states, covariances = np.zeros((n, STATE_DIM)), sigma[..., None] ** 2 * np.eye(STATE_DIM)
-    states[:, POSITION] = track.positions
+    slow = replace(settings, velocity_prior=UNKNOWN_SPEED)
+    states, covariances = measured_only(track.positions, sample_sigmas(settings, n, track.sigmas), slow)
     quality, sides = np.zeros(n, np.int8), np.zeros((n, STATE_DIM, STATE_DIM))
     hits, contacts, innovations = list[int](), [], dict[str, list[Array]]()
     for (first, last), one in zip(parts, found, strict=True):

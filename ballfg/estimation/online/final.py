@@ -4,16 +4,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.events import EventTracker
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
+from ballfg.estimation.plausible import measured_only
 from ballfg.estimation.result import Estimate, Status, joined
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.settle import Earlier
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
 
@@ -37,7 +39,7 @@ class Leaving:
 
         Args: p: number of coefficients.
         """
-        known = [unknown(sample, self.smoother.settings, p) for sample in samples]
+        known = [unknown(sample, self.smoother.settings) for sample in samples]
         n, own = len(samples), slice(STATE_DIM)
         part = Estimate(
             self.track.name,
@@ -88,10 +90,7 @@ def _oldest(estimate: Estimate, count: int) -> Estimate:
     )
 
 
-def unknown(sample: Sample, settings: Settings, p: int) -> tuple[Array, Array]:
+def unknown(sample: Sample, settings: Settings) -> tuple[Array, Array]:
     """A state (9,) known by its observation alone, and its covariance (9 + p, 9 + p) with the coefficients."""
-    state, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM + p)
-    state[POSITION], sigma[POSITION] = sample.position, sample.sigma
-    sigma[VELOCITY], sigma[SPIN] = settings.velocity_prior, settings.spin_prior
-    sigma[STATE_DIM:] = list(settings.coefficients.values())
-    return state, np.diag(sigma**2)
+    (state,), (own,) = measured_only(sample.position[None], sample.sigma[None], settings)
+    return state, block_diag(own, np.diag(np.square(list(settings.coefficients.values()))))

@@ -378,7 +378,7 @@ class Online(Estimator):
         if possible(mean[:STATE_DIM]) and variances_positive(joint):
             joint = definite(joint)
         else:
-            state, joint = unknown(sample, self.settings, window.p)
+            state, joint = unknown(sample, self.settings)
             mean = np.concatenate((state, coefficient_means(self.model, self.settings)))
             status = status if status.failed else Status.IMPLAUSIBLE
         return OnlineState(

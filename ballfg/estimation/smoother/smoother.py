@@ -13,7 +13,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
-from ballfg.estimation.plausible import measured_only, plausible
+from ballfg.estimation.plausible import LEAST_POSITION_SIGMA, measured_only, plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
@@ -295,9 +295,9 @@ class Smoother(Estimator):
         track, values = problem.track, solution.minimum.values
         n, p, covariances = len(track), len(values.coefficients), known
         if covariances is None:  # each state by itself
-            sigmas = problem.coefficient_sigmas
-            _, states = measured_only(track.positions, problem.sigma, problem.settings)
-            covariances = Covariances(states, np.diag(sigmas**2), np.zeros((n, STATE_DIM, p)))
+            least = np.maximum(problem.sigma, LEAST_POSITION_SIGMA)
+            _, states = measured_only(track.positions, least, problem.settings)
+            covariances = Covariances(states, np.diag(problem.coefficient_sigmas**2), np.zeros((n, STATE_DIM, p)))
         status = Status.OK if minimum.convergence in AT_MINIMUM else Status.NOT_CONVERGED
         if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
             status = Status.FAILED
