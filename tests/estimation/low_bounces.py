@@ -15,11 +15,12 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.limits import REST_SPEED
-from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.state import STANDARD_GRAVITY, VZ, Z
 from ballfg.tracks import Track
+from tests.estimation.nees import nees
 from tests.estimation.smoother.one_bounce import flown
 
 MODEL, SURFACES = nominal_model(), Surfaces(0.0)
@@ -60,12 +61,6 @@ def beside_bounces(states: Array) -> Array:
     return np.asarray((speed > REST_SPEED) & ((speed - np.abs(rise)) / STANDARD_GRAVITY < BESIDE))
 
 
-def nees(estimate: Estimate, states: Array) -> Array:
-    """(n,) squared distances of position and velocity from the truth, in standard deviations."""
-    off, covariances = (estimate.states - states)[:, :6], estimate.covariances[:, :6, :6]
-    return np.asarray(np.einsum("ni,ni->n", off, np.linalg.solve(covariances, off[..., None])[..., 0]))
-
-
 def main() -> None:
     """Counts for each of `SETTINGS` the tracks that are sure of a wrong state."""
     parser = argparse.ArgumentParser()
@@ -76,7 +71,7 @@ def main() -> None:
         smoother, fine, wrong, anywhere = Smoother(MODEL, SURFACES, settings), 0, 0, 0
         for states, track in hopping_out(chosen.count, chosen.seed):
             estimate = smoother.estimate(track)
-            far = nees(estimate, states) > LIMIT
+            far = nees(estimate, states, slice(0, 6)) > LIMIT
             if estimate.status is Status.OK:
                 fine, anywhere = fine + 1, anywhere + bool(far.any())
                 wrong += bool((far & ~beside_bounces(states)).any())

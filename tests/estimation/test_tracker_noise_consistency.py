@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.online.online import Online
@@ -19,6 +18,7 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
+from tests.estimation.nees import band, nees
 from tests.estimation.tracker_noise import measured_by
 
 TRACKS = 16
@@ -53,16 +53,6 @@ def tracks() -> list:
     return [(s.true_states, measured_by(s.track, s.true_states, DECLARED, k)) for k, s in enumerate(simulate(CONFIG))]
 
 
-def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-
-
-def band(dimension: int) -> tuple[float, float]:
-    """99 % of the mean of as many chi-squares as there are tracks."""
-    low, high = chi2.ppf([0.005, 0.995], dimension * TRACKS) / TRACKS
-    return low, high
-
-
 ESTIMATORS = {
     "smoother": (Smoother, {}),
     "ekf": (ExtendedKalmanFilter, {}),
@@ -87,12 +77,12 @@ def test_nees_is_inside_its_band(tracks, name) -> None:
     for truth, track in tracks:
         for settings, values in ((DECLARED, told), (WHITE, white)):
             estimate = build(model, surfaces, settings, **options).estimate(track)
-            distances = nees(estimate.states - truth, estimate.covariances)
+            distances = nees(estimate, truth)
             values.append(distances[5:].mean())
             if settings is DECLARED:
                 last.append(distances[-1])
                 whitened.append(estimate.whitened[6:])
-    low, high = band(9)
+    low, high = band(9, TRACKS)
     print(name, low, high, np.mean(told), np.mean(last), np.mean(white))  # shown by -s
     assert low < np.mean(told) < high
     assert low < np.mean(last) < high

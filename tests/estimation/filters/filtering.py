@@ -51,12 +51,6 @@ def simulate(model, settings: Settings, start, times, rng, surfaces=TABLE, label
     return truth, Track(times, measured, labels=labels, name="simulated")
 
 
-def nees(estimate: Estimate, truth: np.ndarray, part: slice = slice(0, 9)) -> np.ndarray:
-    """(n,) squared errors in units of the stated covariance."""
-    error = (estimate.states - truth)[:, part]
-    return np.einsum("ni,ni->n", error, np.linalg.solve(estimate.covariances[:, part, part], error[..., None])[..., 0])
-
-
 def with_positions(track: Track, positions: np.ndarray) -> Track:
     """The track, measured elsewhere."""
     return Track(track.times, positions, labels=track.labels, name=track.name)

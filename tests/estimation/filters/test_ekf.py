@@ -28,20 +28,13 @@ from tests.estimation.filters.filtering import (
     SERVE,
     SPIN_SIGMA,
     TABLE,
-    nees,
     run,
     simulate,
     tensor,
     with_positions,
 )
+from tests.estimation.nees import inside, nees
 from tests.places import DATA
-
-
-def inside(mean: float, dof: int, count: int) -> bool:
-    """The mean of `count` chi-square numbers lies in its 99 % band."""
-    low, high = chi2.ppf([0.005, 0.995], dof * count) / count
-    return bool(low <= mean <= high)
-
 
 # --- a linear problem: gravity alone, no surface -----------------------------------------------------------------
 

@@ -20,7 +20,8 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import Track
-from tests.estimation.filters.filtering import LOW, PLAIN, SERVE, TABLE, nees, run, simulate, tensor, with_positions
+from tests.estimation.filters.filtering import LOW, PLAIN, SERVE, TABLE, run, simulate, tensor, with_positions
+from tests.estimation.nees import nees
 
 
 def test_contact_is_found_where_it_was(flight):

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.stats import chi2
 
 import ballfg as bf
 from ballfg.dynamics import Surfaces
@@ -33,6 +32,7 @@ from ballfg.tracks import read_dataset
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_change import changed
+from tests.estimation.nees import inside, nees
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
 from tests.places import DATA
 
@@ -228,10 +228,8 @@ def test_covariances_are_honest() -> None:
         times, states = simulated.track.times, simulated.true_states
         seen = pixels_of(states[:, :3], times, camera, noise, seed)
         found = estimator.estimate(sighted_track("a", seen, [camera], simulated.track.labels))
-        error = found.states - states
-        values.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariances), error).mean())
-    low, high = chi2.ppf([0.005, 0.995], 9 * tracks) / tracks
-    assert low < np.mean(values) < high
+        values.append(nees(found, states).mean())
+    assert inside(np.mean(values), 9, tracks)
 
 
 def test_a_turned_world_has_turned_states(ball: World) -> None:

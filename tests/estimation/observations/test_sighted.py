@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.observations.ray_path import BEFORE, SPEED, SPREAD, Rays, _robust, rough_path
@@ -24,6 +23,7 @@ from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, Simula
 from ballfg.tracks import Track
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
+from tests.estimation.nees import inside, nees
 from tests.estimation.observations.sighted_rig import NOISE, RIG, Scene, World, late, scene, seen, track_of, world
 
 
@@ -213,11 +213,9 @@ def test_covariances_and_innovations_are_honest() -> None:
         estimate = estimator.estimate(track)
         assert estimate.status is Status.OK
         assert len(track) == len(times)
-        error = estimate.states - made.truth
-        values.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(estimate.covariances), error).mean())
+        values.append(nees(estimate, made.truth).mean())
         nis += estimate.nis.tolist()
-    low, high = chi2.ppf([0.005, 0.995], 9 * tracks) / tracks
-    assert low < np.mean(values) < high
+    assert inside(np.mean(values), 9, tracks)
     assert np.mean(nis) == pytest.approx(2.0, abs=0.15)
     assert estimate.whitened.shape == (len(sightings_of(track)), 2)
 

@@ -21,6 +21,7 @@ from ballfg.factors.linear.covariance import Covariances
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.track import Track
 from ballfg.vision.camera import Camera
+from tests.estimation.nees import nees
 from tests.estimation.observations.sighted_rig import looking
 
 ENDS = (-0.7625, 0.7625, -1.37, 1.37)
@@ -116,7 +117,7 @@ def test_the_number_of_bounces_and_the_distance_hold(view: str) -> None:
             assert OPEN in found.notes
         error = found.states[:, :3] - seen.truth
         inside.append((np.abs(error) < 1.645 * found.sigmas[:, :3]).mean(axis=0))
-        sizes.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariances[:, :3, :3]), error).mean())
+        sizes.append(nees(found, seen.truth, slice(0, 3)).mean())
         depths.append(seen.depth(found))
     assert extra == 0
     assert missed <= 2
