@@ -6,6 +6,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from ballfg.estimation.result import Estimate
+from ballfg.estimation.settings import Settings
+from ballfg.factors.loss import Loss
+
+GAUSSIAN = Settings(loss=Loss(), label_loss=Loss(), spin_loss=Loss(), find_events=False)
+"""With Gaussian noise alone, so that covariances hold and all estimators are told the same."""
 
 
 def nees(estimate: Estimate, truth: np.ndarray, part: slice = slice(0, 9)) -> np.ndarray:

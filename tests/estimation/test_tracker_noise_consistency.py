@@ -13,12 +13,10 @@ import pytest
 
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.online.online import Online
-from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
-from tests.estimation.nees import band, nees
+from tests.estimation.nees import GAUSSIAN, band, nees
 from tests.estimation.tracker_noise import measured_by
 
 TRACKS = 16
@@ -28,17 +26,14 @@ CONFIG = SimulationConfig(
     process=TrueNoise(acceleration=0.1, spin=1.0, contact_velocity=0.02, contact_spin=5.0),
     noise=MeasurementNoise(position=0.003, spin=4.0),
 )
-DECLARED = Settings(
+DECLARED = replace(
+    GAUSSIAN,
     position_noise=(0.002, 0.002, 0.003),
     memory=(0.003, 0.004, 0.003),
     memory_time=0.02,
     stamp_jitter=0.0005,
     process=ProcessNoise(acceleration=0.1, spin=1.0, contact_velocity=0.02, contact_spin=5.0),
     spin_label_noise=4.0,
-    loss=Loss(),
-    label_loss=Loss(),
-    spin_loss=Loss(),
-    find_events=False,
 )
 WHITE = replace(
     DECLARED,

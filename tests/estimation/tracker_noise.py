@@ -8,23 +8,20 @@ import numpy as np
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.estimation.settings import Settings
-from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
+from tests.estimation.nees import GAUSSIAN
 
 G = 9.81
 NOWHERE = Surfaces(-1000.0)
 LABEL = np.array([10.0, -60.0, 20.0])
-FALLING = Settings(
+FALLING = replace(
+    GAUSSIAN,
     position_noise=(0.002, 0.003, 0.004),
     memory=(0.004, 0.003, 0.005),
     memory_time=0.03,
     process=ProcessNoise(acceleration=0.8, spin=3.0),
     spin_label_noise=7.0,
-    loss=Loss(),
-    label_loss=Loss(),
-    spin_loss=Loss(),
-    find_events=False,
 )
 WIDE_SPIN, WIDE_POSITION = 2000.0, 5.0
 """rad/s and m, of the smoother's priors on the first state."""

@@ -9,24 +9,22 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
-from ballfg.estimation import RadarSpeed, Settings, SpinReading
+from ballfg.estimation import RadarSpeed, SpinReading
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
+from tests.estimation.nees import GAUSSIAN
 
 G = 9.81
 NOWHERE = Surfaces(-1000.0)
 NOISE = ProcessNoise(acceleration=0.5, spin=3.0)
 SIGMA, SPEED_SIGMA = 0.004, 0.05
-PLAIN = Settings(
+PLAIN = replace(
+    GAUSSIAN,
     position_noise=(SIGMA,) * 3,
     process=NOISE,
     spin_prior=60.0,
     velocity_prior=20.0,
-    loss=Loss(),
-    spin_loss=Loss(),
-    label_loss=Loss(),
-    find_events=False,
 )
 """Everything Gaussian, so that all estimators are told the same."""
 START = np.array([0.0, 0.0, 1.0, 5.0, -1.0, 3.0, 20.0, 60.0, -10.0])

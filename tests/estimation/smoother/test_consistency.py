@@ -6,6 +6,8 @@ over its stamps; were they independent, the band would be narrower than the one 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,10 +16,9 @@ from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
-from tests.estimation.nees import band, inside, nees
+from tests.estimation.nees import GAUSSIAN, band, inside, nees
 
 TRACKS = 60
 CONFIG = SimulationConfig(
@@ -26,14 +27,11 @@ CONFIG = SimulationConfig(
     process=TrueNoise(acceleration=0.1, spin=1.0, contact_velocity=0.02, contact_spin=5.0),
     noise=MeasurementNoise(position=0.003, spin=4.0),
 )
-SETTINGS = Settings(
+SETTINGS = replace(
+    GAUSSIAN,
     position_noise=(0.003,) * 3,
     process=ProcessNoise(acceleration=0.1, spin=1.0, contact_velocity=0.02, contact_spin=5.0),
     spin_label_noise=4.0,
-    loss=Loss(),
-    label_loss=Loss(),
-    spin_loss=Loss(),
-    find_events=False,
 )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,19 +19,17 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.tracks import Track
+from tests.estimation.nees import GAUSSIAN
 
 G = 9.81
 NOWHERE = Surfaces(-1000.0)
 NOISE = ProcessNoise(acceleration=0.8, spin=3.0)
 LABEL = np.array([10.0, -60.0, 20.0])
-PLAIN = Settings(
+PLAIN = replace(
+    GAUSSIAN,
     position_noise=(0.002, 0.003, 0.004),
     process=NOISE,
     spin_label_noise=7.0,
-    loss=Loss(),
-    label_loss=Loss(),
-    spin_loss=Loss(),
-    find_events=False,
 )
 
 

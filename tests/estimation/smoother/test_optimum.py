@@ -7,19 +7,20 @@ given: the measurements, the numbers of `Settings` and of the model file, and wh
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq, least_squares
 
 from ballfg.dynamics import nominal_model
-from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.graph import LevenbergMarquardt
-from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, MotionNoise as TrueNoise, SimulationConfig, simulate
 from ballfg.tracks import Track
+from tests.estimation.nees import GAUSSIAN
 
 G, DRAG, MAGNUS, E, MU, E_T, OFFSET, RADIUS, SHELL = 9.81, 0.12, 0.0028, 0.93, 0.25, 0.15, -0.003, 0.02, 2 / 3
 Q_ACCELERATION, Q_SPIN, KICK_VELOCITY, KICK_SPIN = 0.2, 2.0, 0.03, 6.0
@@ -147,15 +148,12 @@ CONFIG = SimulationConfig(
     noise=MeasurementNoise(position=SIGMA, spin=LABEL_SIGMA, dropout=0.05),
     process=TrueNoise(Q_ACCELERATION, Q_SPIN, KICK_VELOCITY, KICK_SPIN),
 )
-SETTINGS = Settings(
+SETTINGS = replace(
+    GAUSSIAN,
     position_noise=(SIGMA,) * 3,
     process=ProcessNoise(Q_ACCELERATION, Q_SPIN, KICK_VELOCITY, contact_spin=KICK_SPIN),
     spin_label_noise=LABEL_SIGMA,
     velocity_prior=VELOCITY_SIGMA,
-    loss=Loss(),
-    label_loss=Loss(),
-    spin_loss=Loss(),
-    find_events=False,
 )
 
 
