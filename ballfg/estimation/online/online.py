@@ -20,24 +20,21 @@ from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.launcher import FIRST_SAMPLES, SHOWN, SpinLabel, group_spin, undirected_spin
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
-from ballfg.estimation.online.final import Leaving, unknown
+from ballfg.estimation.online.final import Leaving
+from ballfg.estimation.online.newest import Newest, Update
 from ballfg.estimation.online.state import Measurement, OnlineState, Sample, measurements_beside
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import reach_within, warmed_up
 from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.online.windows.stream_window import StreamWindow
-from ballfg.estimation.plausible import plausible, possible
+from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings, Solver, sample_sigmas, spin_start, total_sigmas
-from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
-from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
-from ballfg.estimation.sides.struck import HitDoubt
 from ballfg.estimation.smoother.motion import FLIGHT
-from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
+from ballfg.estimation.smoother.problem import trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
-from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.machine import collecting_later
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
@@ -118,8 +115,7 @@ class Online(Estimator):
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
         self._undirected: SpinLabel | None = None  # prior of the spin until the launch shows its direction
-        self._monitor: ContactMonitor | None = None  # of the window's ball
-        self._hit = HitDoubt(self.settings, self.events.settings)
+        self._newest: Newest | None = None  # of the window
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._leaving: Leaving | None = None  # where someone asks for states that left the window
         self._origin = StreamOrigin()
@@ -137,8 +133,7 @@ class Online(Estimator):
         if self.window is not None:
             other.window = self.window.copy(other._samples[: len(self.window)])
         other.events = self.events.copy()
-        other._monitor = copy.copy(self._monitor)
-        other._hit = copy.copy(self._hit)
+        other._newest = None if self._newest is None else self._newest.copy()
         other._stream = copy.deepcopy(self._stream)
         other._origin = copy.copy(self._origin)
         return other
@@ -239,22 +234,9 @@ class Online(Estimator):
         newest = self._samples[-1]
         if status is Status.OK and not newest.motion.linked:  # a long gap before it
             status = Status.NO_VELOCITY
-        before = None if rebuilt else before
-        contact = self._near_contact(before, newest)
-        state = self._state(innovation, revised, rebuilt, status, contact)
-        return self._in_doubt_of_a_hit(state, None if contact is not None else before, newest)
-
-    def _in_doubt_of_a_hit(self, state: OnlineState, before: tuple[Array, Array] | None, sample: Sample) -> OnlineState:
-        """The newest state, its covariance widened where its sample may have followed a hit that nothing tells yet."""
-        motion = sample.motion
-        if before is None or not sample.measured or motion is not FLIGHT or not possible(state.state):
-            self._hit.reset()
-            return state
-        assert self._monitor is not None
-        dt, measured = sample.time - self._samples[-2].time, (sample.position, sample.stated, sample.whole)
-        newest = (state.mean, state.joint)
-        joint = self._hit.widened(self._monitor.model, before, dt, measured, newest)
-        return state if joint is state.joint else replace(state, joint=joint, struck=joint - state.joint)
+        assert self._newest is not None
+        update = Update(status, innovation, revised, rebuilt)
+        return self._newest.after(self.window, self._samples, None if rebuilt else before, update)
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""
@@ -266,31 +248,13 @@ class Online(Estimator):
             kind = IsamWindow
         self._keep_budget()
         window = kind(self.ball, self.settings, float(sample.stated.min()), biased, self.reach)
-        self._monitor = ContactMonitor(
-            HypothesisModel(self.ball, self.surfaces, self.settings, window.width - STATE_DIM)
-        )
+        self._newest = Newest(self, window.width - STATE_DIM)
         return window
 
     def _keep_budget(self) -> None:
         """Measures, once, how many states a push may linearise anew."""
         if self.budget_ms is not None and self.reach is None:
             self.reach = reach_within(self, self.budget_ms)
-
-    def _near_contact(self, before: tuple[Array, Array] | None, sample: Sample) -> ContactState | None:
-        """The state to report on either side of a contact, from the belief a sample before; None far from one."""
-        assert self._monitor is not None
-        motion = sample.motion
-        if before is None or motion.hit or not motion.linked or motion.rest is not None:
-            self._monitor.reset()
-            return None
-        dt = sample.time - self._samples[-2].time
-        factors = [measurement.batch for measurement in sample.measurements]
-        measured = SampleMeasurement(sample.position if sample.measured else None, sample.sigma, factors)
-        return self._monitor.step(before, dt, measured, self._has_bounced)
-
-    def _has_bounced(self, count: int) -> bool:
-        """True if the window's ball has bounced in the last `count` intervals."""
-        return any(sample.motion.heights for sample in self._samples[-count:])
 
     def _tell_whole_error(self, sample: Sample) -> None:
         """Sets standard deviations of a new sample's whole error, and the rough velocity for its stamp's error."""
@@ -308,14 +272,13 @@ class Online(Estimator):
         """Takes in one more sighting of the newest sample."""
         assert self.window is not None
         self._samples[-1].measurements.append(sighting)
+        seen: Measurement | None = sighting
         try:
-            innovation = self.window.attach(sighting)
+            update = Update(Status.OK, self.window.attach(sighting))
         except (RuntimeError, ValueError) as error:
-            status, innovation = self._repair(error, Status.OK)
-            return self._state(innovation, 0, True, status, None)
-        assert self._monitor is not None
-        contact = self._monitor.update(SampleMeasurement(factors=[sighting.batch]), self._has_bounced)
-        return self._state(innovation, 0, False, Status.OK, contact)
+            update, seen = Update(*self._repair(error, Status.OK), rebuilt=True), None
+        assert self._newest is not None
+        return self._newest.joined(self.window, self._samples, seen, update)
 
     def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Array]:
         """Explains, goes back to where the explanation changed, appends, moves contacts, cuts the window.
@@ -365,36 +328,6 @@ class Online(Estimator):
             return Status.FAILED, self.window.append_all([newest])
         except (RuntimeError, ValueError):
             raise error from None
-
-    def _state(
-        self, innovation: Array, revised: int, rebuilt: bool, status: Status, contact: ContactState | None
-    ) -> OnlineState:
-        """The state at the newest sample."""
-        assert self.window is not None
-        window, sample = self.window, self._samples[-1]
-        mean, joint = window.newest_belief
-        if contact is not None:
-            mean, joint = contact.mean[: len(mean)], contact.widened[: len(mean), : len(mean)]
-        if possible(mean[:STATE_DIM]) and variances_positive(joint):
-            joint = definite(joint)
-        else:
-            state, joint = unknown(sample, self.settings)
-            mean = np.concatenate((state, coefficient_means(self.model, self.settings)))
-            status = status if status.failed else Status.IMPLAUSIBLE
-        return OnlineState(
-            time=sample.time,
-            mean=mean,
-            joint=joint,
-            coefficient_names=tuple(self.settings.coefficients),
-            world=self.world,
-            name="stream",
-            other_side=None if contact is None else contact.other,
-            innovation=innovation,
-            motion=sample.motion,
-            revised=revised,
-            rebuilt=rebuilt,
-            status=status,
-        )
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track: all samples are pushed, then the window is minimised to a tight tolerance.

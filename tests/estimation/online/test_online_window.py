@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import nominal_model
+from ballfg.estimation.online.newest import has_bounced
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.interval import IntervalMaker
@@ -272,7 +273,8 @@ def test_whether_the_ball_has_bounced_in_the_last_intervals():
     bounced = [k for k, sample in enumerate(online._samples) if sample.motion.heights]
     since = len(online._samples) - bounced[-1]  # intervals from the one with the bounce to the newest, both counted
     assert since > 2
-    assert [online._has_bounced(count) for count in (1, since - 1, since, since + 1)] == [False, False, True, True]
+    found = [has_bounced(online._samples, count) for count in (1, since - 1, since, since + 1)]
+    assert found == [False, False, True, True]
 
 
 def hopping(low: float, n: int, rng: np.random.Generator) -> tuple[np.ndarray, list[float], np.ndarray]:

@@ -1,0 +1,126 @@
+"""What the online estimator says of its newest sample: the window's belief, widened where an event is in doubt."""
+
+import copy
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.online.final import unknown
+from ballfg.estimation.online.state import Measurement, OnlineState, Sample
+from ballfg.estimation.online.windows.stream_window import StreamWindow
+from ballfg.estimation.plausible import possible
+from ballfg.estimation.result import Status
+from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
+from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
+from ballfg.estimation.sides.struck import HitDoubt
+from ballfg.estimation.smoother.motion import FLIGHT
+from ballfg.estimation.smoother.problem import coefficient_means
+from ballfg.factors.linear.definite import definite, variances_positive
+from ballfg.state import STATE_DIM
+
+if TYPE_CHECKING:
+    from ballfg.estimation.online.online import Online
+
+
+@dataclass(frozen=True)
+class Update:
+    """What an observation did to the window; `innovation` is whitened, the rest as of `OnlineState`."""
+
+    status: Status
+    innovation: Array
+    revised: int = 0
+    rebuilt: bool = False
+
+
+class Newest:
+    """Follows both sides of a contact, and samples that contradict the flight.
+
+    Args: owner: the estimator.  further: number of coefficients and biases beside a state of its window.
+    """
+
+    def __init__(self, owner: "Online", further: int) -> None:
+        self.model, self.settings, self.world = owner.model, owner.settings, owner.world
+        self.monitor = ContactMonitor(HypothesisModel(owner.ball, owner.surfaces, owner.settings, further))
+        self.hit = HitDoubt(owner.settings, owner.events.settings)
+
+    def copy(self) -> "Newest":
+        """The same, which further samples leave as it is."""
+        other = copy.copy(self)
+        other.monitor, other.hit = copy.copy(self.monitor), copy.copy(self.hit)
+        return other
+
+    def after(
+        self, window: StreamWindow, samples: list[Sample], before: tuple[Array, Array] | None, update: Update
+    ) -> OnlineState:
+        """The state after a new sample, the last one. Args: before: the belief at the one before it, if it counts."""
+        contact = self._near_contact(samples, before)
+        state = self._state(window, samples[-1], contact, update)
+        return self._in_doubt_of_a_hit(state, samples, None if contact is not None else before)
+
+    def joined(
+        self, window: StreamWindow, samples: list[Sample], sighting: Measurement | None, update: Update
+    ) -> OnlineState:
+        """The state after a further sighting of the newest sample; None: the window was rebuilt with it."""
+        contact = None
+        if sighting is not None:
+            seen = SampleMeasurement(factors=[sighting.batch])
+            contact = self.monitor.update(seen, lambda count: has_bounced(samples, count))
+        return self._state(window, samples[-1], contact, update)
+
+    def _near_contact(self, samples: list[Sample], before: tuple[Array, Array] | None) -> ContactState | None:
+        """The state to report on either side of a contact, from the belief a sample before; None far from one."""
+        sample = samples[-1]
+        motion = sample.motion
+        if before is None or motion.hit or not motion.linked or motion.rest is not None:
+            self.monitor.reset()
+            return None
+        factors = [measurement.batch for measurement in sample.measurements]
+        measured = SampleMeasurement(sample.position if sample.measured else None, sample.sigma, factors)
+        dt = sample.time - samples[-2].time
+        return self.monitor.step(before, dt, measured, lambda count: has_bounced(samples, count))
+
+    def _in_doubt_of_a_hit(
+        self, state: OnlineState, samples: list[Sample], before: tuple[Array, Array] | None
+    ) -> OnlineState:
+        """The state, its covariance widened where its sample may have followed a hit that nothing tells yet."""
+        sample = samples[-1]
+        if before is None or not sample.measured or sample.motion is not FLIGHT or not possible(state.state):
+            self.hit.reset()
+            return state
+        dt, measured = sample.time - samples[-2].time, (sample.position, sample.stated, sample.whole)
+        joint = self.hit.widened(self.monitor.model, before, dt, measured, (state.mean, state.joint))
+        return state if joint is state.joint else replace(state, joint=joint, struck=joint - state.joint)
+
+    def _state(self, window: StreamWindow, sample: Sample, contact: ContactState | None, update: Update) -> OnlineState:
+        """The window's belief at the newest sample, or a contact's; without a possible one, that nothing is known."""
+        mean, joint = window.newest_belief
+        if contact is not None:
+            mean, joint = contact.mean[: len(mean)], contact.widened[: len(mean), : len(mean)]
+        status = update.status
+        if possible(mean[:STATE_DIM]) and variances_positive(joint):
+            joint = definite(joint)
+        else:
+            state, joint = unknown(sample, self.settings)
+            mean = np.concatenate((state, coefficient_means(self.model, self.settings)))
+            status = status if status.failed else Status.IMPLAUSIBLE
+        return OnlineState(
+            time=sample.time,
+            mean=mean,
+            joint=joint,
+            coefficient_names=tuple(self.settings.coefficients),
+            world=self.world,
+            name="stream",
+            other_side=None if contact is None else contact.other,
+            innovation=update.innovation,
+            motion=sample.motion,
+            revised=update.revised,
+            rebuilt=update.rebuilt,
+            status=status,
+        )
+
+
+def has_bounced(samples: list[Sample], count: int) -> bool:
+    """True if the window's ball has bounced in the last `count` intervals."""
+    return any(sample.motion.heights for sample in samples[-count:])
