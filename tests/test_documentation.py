@@ -49,6 +49,16 @@ def test_documents_import_from_rooms(document: Path) -> None:
     assert not wrong, "deeper than one room:\n" + "\n".join(wrong)
 
 
+def test_files_and_functions_in_explanations_of_the_code_are_there() -> None:
+    files, wrong = [*MODULES.values(), *(ROOT / "tests").rglob("*.py")], list[str]()
+    for document in (ROOT / "docs" / "map.md", *(ROOT / "docs" / "derivations").glob("*.md")):
+        for name, function in re.findall(r"`([\w/]+\.py)(?:: (\w+))?", document.read_text(encoding="utf-8")):
+            texts = [path.read_text(encoding="utf-8") for path in files if path.as_posix().endswith(f"/{name}")]
+            if not any(re.search(rf"\b(?:def|class) {function}" if function else "", text) for text in texts):
+                wrong.append(f"{document.name}: {name} {function}")
+    assert not wrong
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_names_in_documents_are_public(document: Path) -> None:
     for line, module, names in imports(document):
