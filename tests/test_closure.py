@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 
+from tests.interpreter import fresh
 from tests.test_layout import MODULES
 
 STARTS = (
@@ -91,6 +92,14 @@ def test_what_is_imported_is_what_the_syntax_says() -> None:
     modules = set(said.stdout.split())
     assert {module for module in modules if module.split(".")[0] == "ballfg"} <= closure(STARTS)
     assert not modules & {"cv2", "gtsam", "pandas", "scipy.optimize", "scipy.sparse", "scipy.special", "sympy"}
+
+
+def test_the_online_estimator_needs_nothing_of_scipy() -> None:
+    """A robot's program starts without it: its linear algebra takes some tenths of a second to import."""
+    said = fresh("import sys; from ballfg.estimation import Online; print(*sys.modules)", check=True).stdout
+    modules = set(said.split())
+    assert "ballfg.estimation.online.final" in modules
+    assert not modules & {"gtsam", "scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.special"}
 
 
 if __name__ == "__main__":

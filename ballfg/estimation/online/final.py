@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.events import EventTracker
@@ -93,4 +92,4 @@ def _oldest(estimate: Estimate, count: int) -> Estimate:
 def unknown(sample: Sample, settings: Settings) -> tuple[Array, Array]:
     """A state (9,) known by its observation alone, and its covariance (9 + p, 9 + p) with the coefficients."""
     (state,), (own,) = measured_only(sample.position[None], sample.sigma[None], settings)
-    return state, block_diag(own, np.diag(np.square(list(settings.coefficients.values()))))
+    return state, np.diag(np.concatenate((np.diagonal(own), np.square([*settings.coefficients.values()]))))
