@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 PAIRS: Final = 64  # Least number of pairs of possible balls, opposite about the mean; shares are right to some 0.03
 STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is right to 0.2 mm after one
 SPANS: Final = 8
-"""Number of parts of the horizon in which a possible ball has a random acceleration each. A later part is longer: none
-may last longer than the time before it, else balls lie too close together in it."""
+"""Number of parts of the horizon in which a possible ball has a random acceleration each. A later part is longer: up to
+10 s ahead it lasts at most a step longer than the time before it, else balls lie too close together in it."""
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce

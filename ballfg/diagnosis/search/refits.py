@@ -1,4 +1,4 @@
-"""Refits a model with further effects, and says which refits may be worth their time."""
+"""Refits a model with further effects or labels in another frame, and says which refits may be worth their time."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
