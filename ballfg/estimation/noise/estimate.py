@@ -41,7 +41,7 @@ T = TypeVar("T")
 LONGEST_PART: Final = 0.75
 """s, usually used part of a track: forecasts of 0.3 s that start 0.2 s after the first sample or somewhat later."""
 MOST_TRACKS: Final = 80
-"""Number of used tracks, which take about a second. By the noise that 20 show, 90 % intervals of the set may
+"""Number of used tracks, which take one to three seconds. By the noise that 20 show, 90 % intervals of the set may
 hold 72 %."""
 MOST_ITERATIONS: Final = 25
 EARLIEST_SHARE: Final = 0.7

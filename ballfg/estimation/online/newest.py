@@ -1,4 +1,4 @@
-"""What the online estimator says of its newest sample: the window's belief, widened where an event is in doubt."""
+"""The newest sample of a stream is told with the window's belief, widened where an event is in doubt."""
 
 import copy
 from dataclasses import dataclass, replace
