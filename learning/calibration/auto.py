@@ -154,8 +154,8 @@ def _folds(
         step = calibrate.advanced(problem, fitted.steps[-2], linear.without(names[k::FOLDS]))
         settings = calibrate.population_settings(problem, step)
         if noise is not None:
-            factor, own = noise.coefficient_factor, settings.coefficients
-            spreads = {name: factor * own[name] for name in noise.noise.coefficients}
+            own = settings.coefficients
+            spreads = {name: factor * own[name] for name, factor in noise.coefficient_factors.items()}
             settings = with_noise(settings, replace(noise.noise, coefficients=spreads))
         made.append((calibrate.population_model(problem, step), settings))
     return _judged(problem, made, watch)

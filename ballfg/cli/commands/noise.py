@@ -26,7 +26,7 @@ MEANINGS = {
     "contact_velocity": ("scatter of the velocity after a bounce", 1.0, "m/s"),
     "contact_tangential": ("the same, in addition, along the surface", 1.0, "m/s"),
     "contact_spin": ("scatter of the spin after a bounce", 1.0, "rad/s"),
-    "coefficients": ("spread of coefficients from track to track / usual", 1.0, ""),
+    "coefficients": ("spread of {} / its usual one", 1.0, ""),
 }
 """Meaning of each number, factor to its printed unit, and that unit."""
 UNKNOWN = 0.7  # Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude
@@ -97,7 +97,10 @@ def noise(
     print(f"{dataset}: noise from {found.tracks} tracks, {found.starts} forecasts of up to 0.3 s in them")
     for line in _table(found):
         print(line)
-    before = found.held_before if assumed == usual else held_with(ball, surfaces, assumed, chosen)
+    if assumed in (usual, found.settings):
+        before = found.held_before if assumed == usual else found.held
+    else:
+        before = held_with(ball, surfaces, assumed, chosen)
     print(
         f"90 % intervals of these forecasts hold {100 * found.held:.0f} %; with the noise assumed so far "
         f"{100 * before:.0f} %"
@@ -128,9 +131,10 @@ def check_known(found: "NoiseEstimate", dataset: Path) -> None:
     positions = [name for name in found.relative_errors if name.startswith("position")]
     unknown = min((found.relative_errors[name] for name in positions), default=0.0) >= PRIOR
     unknown = unknown and all(math.isinf(found.intervals[name][1]) for name in positions)  # else they are exact
-    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
+    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factors}
     held = {name: content.get(name) or 0.0 for name in MOST}
-    largest = {name: max(value) if isinstance(value, list | tuple) else float(value) for name, value in held.items()}
+    several = {name: value.values() if isinstance(value, dict) else value for name, value in held.items()}
+    largest = {name: float(value) if isinstance(value, float) else max(value) for name, value in several.items()}
     absurd = [
         f"{MEANINGS[name][0].partition(',')[0]} {largest[name]:.2g}" for name in MOST if largest[name] > MOST[name]
     ]
@@ -143,13 +147,14 @@ def check_known(found: "NoiseEstimate", dataset: Path) -> None:
 
 
 def _table(found: "NoiseEstimate") -> list[str]:
-    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
+    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factors}
     lines = []
     for name, error in found.relative_errors.items():
         field, _, axis = name.partition(".")
         meaning, factor, unit = MEANINGS[field]
         value = content[field]
-        number = factor * (value["xyz".index(axis)] if axis else value)
+        one = value[axis] if isinstance(value, dict) else value["xyz".index(axis)] if axis else value
+        number = factor * one
         doubt = "  (hardly known)" if error >= UNKNOWN else ""
         limits = _limits(*(factor * limit for limit in found.intervals[name]))
         factor_of_error = math.exp(min(error, MOST_ERROR))

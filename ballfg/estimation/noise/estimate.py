@@ -23,6 +23,7 @@ from ballfg.estimation.noise.marginal import scatter_of
 from ballfg.estimation.noise.parameters import (
     COEFFICIENTS,
     Parameter,
+    coefficient_factors,
     parameters_of,
     tensors_of,
     track_noise,
@@ -59,10 +60,10 @@ class NoiseEstimate:
     Attributes:
         noise: standard deviations.
         relative_errors: standard deviation of each number's logarithm, by name, with `.x`, `.y`, `.z` if there is one
-            per axis; the larger one of its two sides.
+            per axis, and `coefficients.` before that of a coefficient; the larger one of its two sides.
         intervals: of the same numbers, one standard deviation to each side, in their own units; from 0 or to infinity
             if the tracks do not bound a number below or above.
-        coefficient_factor: spread of coefficients from track to track, as a multiple of the settings'.
+        coefficient_factors: spread of each coefficient from track to track, as a multiple of the settings'.
         settings: with that noise.
         held_before: share of forecast coordinates inside their 90 % intervals with the settings given.
         held: the same with this noise.
@@ -73,12 +74,17 @@ class NoiseEstimate:
     noise: TrackNoise
     relative_errors: dict[str, float]
     intervals: dict[str, tuple[float, float]]
-    coefficient_factor: float
+    coefficient_factors: dict[str, float]
     settings: Settings
     held_before: float
     held: float
     tracks: int
     starts: int
+
+    @property
+    def coefficient_factor(self) -> float:
+        """The geometric mean of `coefficient_factors`; 1 without coefficients."""
+        return float(np.exp(np.log(list(self.coefficient_factors.values()) or 1.0).mean()))
 
 
 def estimate_noise(
@@ -155,7 +161,7 @@ def _searched(
         noise=found,
         relative_errors=dict(zip(search.names, sides.max(axis=1).tolist(), strict=False)),
         intervals=dict(zip(search.names, _intervals(logs, sides, OPEN * search.spread), strict=False)),
-        coefficient_factor=float(np.exp(logs[-1])) if parameters[-1].name == COEFFICIENTS else 1.0,
+        coefficient_factors=coefficient_factors(parameters, logs, settings),
         settings=with_noise(settings, found),
         held_before=search.held(search.start),
         held=search.held(logs),
@@ -283,8 +289,10 @@ class _Search:
 
     @property
     def names(self) -> list[str]:
-        """Names of the numbers, with `.x`, `.y`, `.z` if there is one per axis."""
-        return [p.name if p.axis is None else f"{p.name}.{'xyz'[p.axis]}" for p in self.parameters]
+        """Names of the numbers, with `.x`, `.y`, `.z` if there is one per axis, or that of the coefficient."""
+        names = tuple(self.settings.coefficients)
+        parts = [(p, names if p.name == COEFFICIENTS else "xyz") for p in self.parameters]
+        return [p.name if p.axis is None else f"{p.name}.{of[p.axis]}" for p, of in parts]
 
     def _scatter(self, logs: Array) -> Array:
         """(k, k) sum over tracks of the squares of their gradients about the mean."""

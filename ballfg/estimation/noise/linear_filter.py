@@ -26,7 +26,7 @@ class Noise:
         memory: (r, 3) m^2, variances.  memory_time: (r,) s.  stamp_jitter: (r,) s^2, variance.
         process: (r, 7) the numbers of `PROCESS_NOISE`.
         spin_label, spin_prior: (r,) rad/s.
-        coefficients: (r,) multiple of their prior standard deviations.
+        coefficients: (r, p) multiples of their prior standard deviations; (r, 1) one for all.
     """
 
     position: Tensor

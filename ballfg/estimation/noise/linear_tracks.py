@@ -80,14 +80,14 @@ class LinearTracks:
         Args:
             spin: (r,) rad/s, standard deviation per axis of spins without a label; one row for all tracks or for each.
             label: (r,) rad/s, of a label.
-            coefficients: (r,) multiple of `coefficient_sigmas`.
+            coefficients: (r, p) multiples of `coefficient_sigmas`.
             velocity: m/s, standard deviation per axis.
         """
         count = len(self)
         spins = torch.where(self.labelled, self.label_spreads * label, spin)[:, None].expand(count, 3)
         spins = torch.where(self.group_sigmas.isnan(), spins, self.group_sigmas).square()
         fixed = torch.tensor([START_POSITION_SIGMA**2] * 3 + [velocity**2] * 3, dtype=torch.float64)
-        own = (coefficients[:, None] * self.coefficient_sigmas).square()
+        own = (coefficients * self.coefficient_sigmas).square()
         return torch.cat((fixed.expand(count, 6), spins, own.expand(count, -1)), dim=1)
 
 

@@ -21,7 +21,7 @@ class Parameter:
 
     Attributes:
         name: a field of `TrackNoise`.
-        axis: 0, 1, 2 for x, y, z; None for one number for all.
+        axis: 0, 1, 2 for x, y, z, or the place of a coefficient; None for one number for all.
         start: its prior median, in its own unit.
         spread: prior standard deviation of its logarithm.
         low, high: limits, in its own unit.
@@ -80,8 +80,8 @@ def parameters_of(
         found.append(Parameter("spin_label", None, label, FACTOR_FOUR, 1.0 / unit, 300.0 / unit))
     if not bool((tracks.labelled | ~tracks.group_sigmas.isnan().any(dim=1)).all()):
         found.append(Parameter("spin_prior", None, settings.spin_prior, FACTOR_FOUR, 3.0, 500.0))
-    if settings.coefficients:
-        found.append(Parameter(COEFFICIENTS, None, 1.0, FACTOR_TWO, 0.03, 5.0))
+    # each has its own multiple: short parts show how much drags differ, and nothing of bounces that are still to come
+    found += [Parameter(COEFFICIENTS, place, 1.0, FACTOR_TWO, 0.03, 5.0) for place in range(len(settings.coefficients))]
     return found
 
 
@@ -97,6 +97,7 @@ def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) ->
 
     white = settings.position_scale * np.array(settings.position_noise)
     process = [one(name, getattr(settings.process, name)) for name in PROCESS_NOISE]
+    places = [p.axis for p in parameters if p.name == COEFFICIENTS] or [None]
     return Noise(
         position=torch.stack([one("position", white[a], a) / white[a] for a in range(3)], dim=-1),
         memory=torch.stack([one("memory", settings.memory[a], a) for a in range(3)], dim=-1).square(),
@@ -105,20 +106,25 @@ def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) ->
         process=torch.stack(process, dim=-1),
         spin_label=one("spin_label", settings.spin_label_noise),
         spin_prior=one("spin_prior", settings.spin_prior),
-        coefficients=one(COEFFICIENTS, 1.0),
+        coefficients=torch.stack([one(COEFFICIENTS, 1.0, place) for place in places], dim=-1),
     )
 
 
 def track_noise(parameters: list[Parameter], logs: Array, settings: Settings) -> TrackNoise:
     """The noise for a vector of logarithms (k,), in the form of a file."""
     values: dict[str, object] = {}
-    for name in dict.fromkeys(p.name for p in parameters):
+    for name in dict.fromkeys(p.name for p in parameters if p.name != COEFFICIENTS):
         numbers = [float(np.exp(log)) for p, log in zip(parameters, logs, strict=True) if p.name == name]
         values[name] = tuple(numbers) if len(numbers) == 3 else numbers[0]
-    factor = values.pop(COEFFICIENTS, 1.0)
-    assert isinstance(factor, float)
-    spreads = {name: factor * sigma for name, sigma in settings.coefficients.items()}
+    factors = coefficient_factors(parameters, logs, settings)
+    spreads = {name: factors[name] * sigma for name, sigma in settings.coefficients.items()}
     return TrackNoise(**values, coefficients=spreads)  # type: ignore[arg-type]
+
+
+def coefficient_factors(parameters: list[Parameter], logs: Array, settings: Settings) -> dict[str, float]:
+    """The spread of each coefficient for logarithms (k,), as a multiple of the settings'; 1 if it is not estimated."""
+    found = {p.axis: float(np.exp(log)) for p, log in zip(parameters, logs, strict=True) if p.name == COEFFICIENTS}
+    return {name: found.get(place, 1.0) for place, name in enumerate(settings.coefficients)}
 
 
 def with_medians(settings: Settings, usual: Settings, *, position_known: bool) -> Settings:

@@ -159,7 +159,7 @@ def value_of(estimate: NoiseEstimate, name: str) -> float:
     """The number of a name with its axis, in its own unit."""
     field, _, axis = name.partition(".")
     if field == "coefficients":
-        return estimate.coefficient_factor
+        return estimate.coefficient_factors[axis]
     value = getattr(estimate.noise, field)
     return float(value["xyz".index(axis)] if axis else value)
 
@@ -195,8 +195,9 @@ class Row:
 def rows_of(world: World, estimate: NoiseEstimate) -> Iterator[Row]:
     """All numbers of a set that its world has: a label is none of a part of a track that begins after a hit."""
     for name, error in estimate.relative_errors.items():
-        if name in world.values:
-            yield Row(name, world.values[name], value_of(estimate, name), error, *estimate.intervals[name])
+        planted = "coefficients" if name.startswith("coefficients.") else name
+        if planted in world.values:
+            yield Row(name, world.values[planted], value_of(estimate, name), error, *estimate.intervals[name])
 
 
 def worlds(

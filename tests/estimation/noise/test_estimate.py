@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.dynamics import load_model
+from ballfg.dynamics import load_model, nominal_model
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces, estimate_noise, predict_tracks
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, write_simulation
@@ -81,6 +81,26 @@ def test_planted_acceleration_comes_back(recorded):
     assert whole.noise.acceleration == pytest.approx(0.5, rel=0.2)
     with pytest.raises(ValueError, match=r"longest must be at least 0; got -1\. Correct it"):
         estimate_noise(model, surfaces, settings, tracks, longest=-1.0)
+
+
+def test_drags_that_are_alike_say_nothing_of_a_bounce_ahead(tmp_path):
+    """All drags are one, the table's restitution lies 1.5 usual spreads off, and no observed part has a bounce."""
+    shots = SimulationConfig(
+        24, 120.0, seed=3, noise=MeasurementNoise(position=0.001), undeclared=parse_effects(["restitution.e=0.90"])
+    )
+    write_simulation(tmp_path / "shots", shots)
+    dataset = read_dataset(tmp_path / "shots")
+    model, tracks = nominal_model(dataset.ball), list(dataset)
+    surfaces, usual = dataset_surfaces(dataset), dataset_settings(dataset, model)
+    parts = [track.opening(0.2) for track in tracks]
+    found = estimate_noise(model, surfaces, usual, parts, errors=False)
+    spreads = found.noise.coefficients
+    assert spreads["flight.drag.k"] < 0.5 * usual.coefficients["flight.drag.k"]
+    for name in ("bounce.restitution.e", "bounce.table_height.offset"):
+        assert spreads[name] == pytest.approx(usual.coefficients[name], rel=0.05)
+    ahead = predict_tracks(Smoother(model, surfaces, found.settings), tracks, len(tracks), 0.2, horizon=0.6)
+    errors = np.concatenate([((one.measured - one.positions) / one.sigmas)[-10:, 2] for one in ahead])
+    assert (np.abs(errors) < 1.645).mean() > 0.84
 
 
 def test_nothing_to_tell(recorded):

@@ -177,7 +177,9 @@ def test_curvature_and_scatter_behind_the_error_bars(case):
     """H and G of H^-1 (G + P) H^-1, by second differences of the objective itself and by the tracks one by one."""
     *_, settings, _, linear, forecaster = case
     known = parameters_of(settings, linear, position_known=True)
-    search = _Search(forecaster, [p for p in known if p.name == "acceleration" or p.axis == 2], settings)
+    search = _Search(
+        forecaster, [p for p in known if p.name == "acceleration" or (p.name, p.axis) == ("memory", 2)], settings
+    )
     logs, step = np.log([0.003, 0.1]), 0.05
     moves = step * np.eye(2)
     hessian = np.empty((2, 2))

@@ -23,7 +23,7 @@ NUMBERS = {
     "process": (0.2, 0.1, 0.3, 5.0, 0.01, 0.4, 0.2),
     "spin_label": 20.0,
     "spin_prior": 60.0,
-    "coefficients": 1.1,
+    "coefficients": (1.1,),
 }
 
 

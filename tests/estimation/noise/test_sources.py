@@ -25,12 +25,12 @@ NUMBERS = {
     "process": (0.2, 3.0, 0.05, 0.2, 5.0, 0.4, 0.2),
     "spin_label": 20.0,
     "spin_prior": 60.0,
-    "coefficients": 1.0,
+    "coefficients": (1.0,),
 }
 ALONE = {
     "observed": {"position": (1.0, 1.3, 0.8)},
     "spin": {"spin_label": 20.0, "spin_prior": 60.0},
-    "coefficients": {"coefficients": 1.0},
+    "coefficients": {"coefficients": (1.0,)},
     "tracker": {"memory": (4e-6, 1e-6, 2e-6), "stamp_jitter": 1e-7},
     "bounces": {"process": (0.0, 0.0, 0.05, 0.2, 5.0, 0.4, 0.2)},
     "motion": {"process": (0.2, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0)},
