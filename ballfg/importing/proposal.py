@@ -21,6 +21,7 @@ from ballfg.importing.frame import TURNS, Frame, find_frame
 from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels
 from ballfg.importing.several_balls import balls_of
 from ballfg.importing.shots import Counts, SourceShot
+from ballfg.importing.spins import with_spins
 from ballfg.importing.stamps import in_seconds, origin_of
 from ballfg.tracks import Track
 from ballfg.tracks.checks import Findings, tidy
@@ -164,7 +165,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     some = shots[:: max(1, len(shots) // MOST_SHOTS)]
     frame, guesses = find_frame([relative(shot) for shot in some], choices, roles.length_unit, stated_time, time_why)
     shots, split_guess = split(shots, roles, frame, choices)
-    shots = with_labels(shots, beside)
+    shots, spin_notes = with_spins(with_labels(shots, beside))
     tracks, notes = _tracks(shots, frame, roles.sigma_units)
     ball, ball_guess, ball_doubt = ball_of(choices, frame)
     recorded = recordings(tracks)
@@ -191,7 +192,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     used = (*roles.time, *roles.places, roles.frame)
     doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]
     table_notes = list(dict.fromkeys(note for notes_of_one in doubts for note in notes_of_one))
-    return Proposal(info, tracks, guesses, [*table_notes[:5], *counts.notes(), *notes])
+    return Proposal(info, tracks, guesses, [*table_notes[:5], *counts.notes(), *spin_notes, *notes])
 
 
 def _unseen(roles: Roles) -> list[str]:

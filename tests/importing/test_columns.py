@@ -68,6 +68,34 @@ def test_a_spin_label_turns_with_the_axes(flip: str | None) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "turns"),
+    [("spin_{} [rpm]", 60.0), ("spin_{}_rpm", 60.0), ("Spin {} (rev/s)", 1.0), ("spin_{}_rev_per_s", 1.0),
+     ("w{} [deg/s]", 360.0), ("omega_{}_rad_s", 2.0 * np.pi), ("spin_{}", 2.0 * np.pi)],
+)  # fmt: skip
+def test_a_spin_label_has_the_unit_of_its_name(name: str, turns: float, tmp_path: Path) -> None:
+    """A turn in a second, in each unit; with y up."""
+    t, p = thrown()
+    spin = np.array([3.0, -20.0, 7.0])  # turns in a second, in the frame with z up
+    seen = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # x, up, -y
+    names = ["t", "x", "y", "z", *(name.format(axis) for axis in "xyz")]
+    rows = np.column_stack((t, p @ seen.T, np.tile(turns * seen @ spin, (len(t), 1)))).tolist()
+    proposal = propose(write_rows(tmp_path / "a.csv", ",".join(names), rows), Choices())
+    (track,) = proposal.tracks
+    np.testing.assert_allclose(track.spin_label, 2.0 * np.pi * spin, rtol=1e-9)
+    assert any("rad/s from" in note for note in proposal.notes) == (name != "spin_{}")
+
+
+@pytest.mark.parametrize("names", [("wx", "wy", "wz"), ("spin_x [rpm]", "spin_y [rpm]", "spin_z")])
+def test_spins_without_a_unit_stay_labels_and_that_is_said(names: tuple[str, ...], tmp_path: Path) -> None:
+    t, p = thrown()
+    rows = np.column_stack((t, p, np.tile([1.0, 2.0, 3.0], (len(t), 1)))).tolist()
+    proposal = propose(write_rows(tmp_path / "a.csv", ",".join(("t", "x", "y", "z", *names)), rows), Choices())
+    assert proposal.tracks[0].spin_label is None
+    said = f"{', '.join(names)} stay labels: a spin needs spin_x, spin_y and spin_z in rad/s"
+    assert any(note.startswith(said) for note in proposal.notes)
+
+
+@pytest.mark.parametrize(
     ("name", "yes", "no"), [("valid", "1", "0"), ("Ball_Visible", "True", "False"), ("is tracked", "1.0", "0.0")]
 )
 def test_rows_where_a_column_says_that_the_ball_was_not_seen_are_missing(
