@@ -44,10 +44,14 @@ class Gain:
         return "worse" if self.low > 0.0 and self.mean > LEAST else "no different"
 
     def __str__(self) -> str:
-        return (
+        said = (
             f"errors change by {100 * self.mean:+.0f} % ({100 * self.low:+.0f} to {100 * self.high:+.0f} %, 95 % "
             f"interval over {self.tracks} tracks that were not fitted)"
-        ) + ("" if self.density is None else f"; what was measured is {np.exp(self.density[0]):.2f} times as probable")
+        )
+        if self.density is None:
+            return said
+        mean, low = np.exp(self.density)
+        return f"{said}; what was measured is {mean:.2f} times as probable (surely {low:.2f} times)"
 
 
 def denser(before: Array, after: Array) -> tuple[float, float]:

@@ -88,6 +88,8 @@ def test_the_density_decides_where_errors_do_not() -> None:
     for density, word in (((mean, low), "better"), ((0.3, 0.05), "no different"), ((0.05, 0.04), "no different")):
         assert replace(gain, density=density).word == word
     assert f"{np.exp(mean):.2f} times as probable" in str(replace(gain, density=(mean, low)))
+    unsure = str(replace(gain, density=(0.3, 0.05)))  # its lower end is what decides
+    assert unsure.endswith("1.35 times as probable (surely 1.05 times)")
     worse = gain_of(before, 1.5 * before * np.exp(rng.normal(0.0, 0.01, 12)))
     assert worse is not None
     assert replace(worse, density=(mean, low)).word == "worse"
