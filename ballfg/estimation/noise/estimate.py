@@ -49,6 +49,9 @@ EARLIEST_SHARE: Final = 0.7
 """Share of a short track before the first forecast."""
 EVERY_SHARE: Final = 0.12
 """Share of a short track between two starts."""
+FIXED_TRACKER: Final = 0.1
+"""Weight of the next samples where the tracker's errors are fixed: what these lack shows in the next samples, and would
+count as motion. Else it is 1."""
 OPEN: Final = 0.7
 """In standard deviations of the prior: an interval beyond it is open, since the prior and not the tracks ends it."""
 
@@ -191,7 +194,8 @@ def _search(parts: Sequence[Track], settings: Settings, known: tuple[bool, bool]
     typical = float(np.median([part.duration for part in parts]))
     earliest, every = min(EARLIEST_START, EARLIEST_SHARE * typical), min(START_EVERY, EVERY_SHARE * typical)
     biased = settings.has_memory or not known[1]
-    forecaster = Forecaster(linear, settings.velocity_prior, earliest, every, biased=biased)
+    weight = FIXED_TRACKER if known[1] else 1.0
+    forecaster = Forecaster(linear, settings.velocity_prior, earliest, every, biased=biased, next_samples=weight)
     return _Search(forecaster, parameters_of(settings, linear, *known), settings)
 
 

@@ -60,6 +60,7 @@ class Forecaster:
         earliest: s after the first sample, of the first forecast origin.
         every: s between origins.
         biased: True if the noise may have a memory.
+        next_samples: weight of the next samples beside the forecasts.
 
     Attributes:
         starts: (r, 2) track and sample of each forecast origin.
@@ -73,7 +74,9 @@ class Forecaster:
         every: float = START_EVERY,
         *,
         biased: bool = True,
+        next_samples: float = 1.0,
     ) -> None:
+        self.next_samples = next_samples
         self.tracks, self.filter = tracks, LinearFilter(tracks, velocity_prior, biased=biased)
         self.count, self.samples = tracks.times.shape
         self.starts = self._starts(earliest, every)
@@ -92,7 +95,7 @@ class Forecaster:
         measured = self.filter.measured(noise)
         filtered = self.filter.run(noise, measured)
         total, inside, count = self._forecast(filtered, noise, measured)
-        by_track = total / max(count, 1) + filtered.nll / max(filtered.count, 1)
+        by_track = total / max(count, 1) + self.next_samples * filtered.nll / max(filtered.count, 1)
         return Score(by_track, inside / max(3 * count, 1), len(self.starts))
 
     def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
