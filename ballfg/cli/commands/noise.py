@@ -97,8 +97,10 @@ def noise(
     print(f"{dataset}: noise from {found.tracks} tracks, {found.starts} forecasts of up to 0.3 s in them")
     for line in _table(found):
         print(line)
-    if assumed in (usual, found.settings):
-        before = found.held_before if assumed == usual else found.held
+    if assumed == usual:
+        before = found.held_before
+    elif assumed == found.settings:
+        before = found.held
     else:
         before = held_with(ball, surfaces, assumed, chosen)
     print(
@@ -131,10 +133,10 @@ def check_known(found: "NoiseEstimate", dataset: Path) -> None:
     positions = [name for name in found.relative_errors if name.startswith("position")]
     unknown = min((found.relative_errors[name] for name in positions), default=0.0) >= PRIOR
     unknown = unknown and all(math.isinf(found.intervals[name][1]) for name in positions)  # else they are exact
-    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factors}
-    held = {name: content.get(name) or 0.0 for name in MOST}
-    several = {name: value.values() if isinstance(value, dict) else value for name, value in held.items()}
-    largest = {name: float(value) if isinstance(value, float) else max(value) for name, value in several.items()}
+    numbers = _numbers(found)
+    largest = {
+        field: max((n for name, n in numbers.items() if name.split(".")[0] == field), default=0.0) for field in MOST
+    }
     absurd = [
         f"{MEANINGS[name][0].partition(',')[0]} {largest[name]:.2g}" for name in MOST if largest[name] > MOST[name]
     ]
@@ -146,15 +148,25 @@ def check_known(found: "NoiseEstimate", dataset: Path) -> None:
         )
 
 
-def _table(found: "NoiseEstimate") -> list[str]:
+def _numbers(found: "NoiseEstimate") -> dict[str, float]:
+    """All numbers in SI units, by their names in `NoiseEstimate.relative_errors`."""
     content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factors}
-    lines = []
+    numbers: dict[str, float] = {}
+    for field, value in content.items():
+        if isinstance(value, float):
+            numbers[field] = value
+        else:
+            parts = value if isinstance(value, dict) else dict(zip("xyz", value, strict=True))
+            numbers |= {f"{field}.{part}": number for part, number in parts.items()}
+    return numbers
+
+
+def _table(found: "NoiseEstimate") -> list[str]:
+    lines, numbers = [], _numbers(found)
     for name, error in found.relative_errors.items():
         field, _, axis = name.partition(".")
         meaning, factor, unit = MEANINGS[field]
-        value = content[field]
-        one = value[axis] if isinstance(value, dict) else value["xyz".index(axis)] if axis else value
-        number = factor * one
+        number = factor * numbers[name]
         doubt = "  (hardly known)" if error >= UNKNOWN else ""
         limits = _limits(*(factor * limit for limit in found.intervals[name]))
         factor_of_error = math.exp(min(error, MOST_ERROR))

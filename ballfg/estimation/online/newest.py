@@ -59,12 +59,10 @@ class Newest:
         state = self._state(window, samples[-1], contact, update)
         return self._in_doubt_of_a_hit(state, samples, None if contact is not None else before)
 
-    def joined(
-        self, window: StreamWindow, samples: list[Sample], sighting: Measurement | None, update: Update
-    ) -> OnlineState:
-        """The state after a further sighting of the newest sample; None: the window was rebuilt with it."""
+    def joined(self, window: StreamWindow, samples: list[Sample], sighting: Measurement, update: Update) -> OnlineState:
+        """The state after a further sighting of the newest sample; a rebuilt window holds it without a contact."""
         contact = None
-        if sighting is not None:
+        if not update.rebuilt:
             seen = SampleMeasurement(factors=[sighting.batch])
             contact = self.monitor.update(seen, lambda count: has_bounced(samples, count))
         return self._state(window, samples[-1], contact, update)

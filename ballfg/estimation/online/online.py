@@ -272,13 +272,12 @@ class Online(Estimator):
         """Takes in one more sighting of the newest sample."""
         assert self.window is not None
         self._samples[-1].measurements.append(sighting)
-        seen: Measurement | None = sighting
         try:
             update = Update(Status.OK, self.window.attach(sighting))
         except (RuntimeError, ValueError) as error:
-            update, seen = Update(*self._repair(error, Status.OK), rebuilt=True), None
+            update = Update(*self._repair(error, Status.OK), rebuilt=True)
         assert self._newest is not None
-        return self._newest.joined(self.window, self._samples, seen, update)
+        return self._newest.joined(self.window, self._samples, sighting, update)
 
     def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Array]:
         """Explains, goes back to where the explanation changed, appends, moves contacts, cuts the window.
