@@ -18,13 +18,8 @@ from ballfg.estimation.configure import dataset_surfaces, fitted_settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import LEAST, NEAR, UNLEARNED, Choice, choose_candidate, compared
-from ballfg.learning.calibration.calibrate import (
-    Problem,
-    fitted_noise,
-    population_model,
-    population_settings,
-    pose,
-)
+from ballfg.learning.calibration.calibrate import fitted_noise
+from ballfg.learning.calibration.problem import Problem, population_model, population_settings, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.training import ObserveConfig, TrainConfig
 from ballfg.learning.evaluation import TrackScore, judge_track

@@ -25,7 +25,8 @@ from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.observations.sightings import TIME_OFFSET, sightings_of
 from ballfg.estimation.registry import make_estimator
 from ballfg.front import estimator_for
-from ballfg.learning.calibration.calibrate import calibrate, population_model, population_settings, pose
+from ballfg.learning.calibration.calibrate import calibrate
+from ballfg.learning.calibration.problem import population_model, population_settings, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, Track

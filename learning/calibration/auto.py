@@ -20,6 +20,8 @@ from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.calibration import calibrate
 from ballfg.learning.calibration.groups import OWN, Groups
+from ballfg.learning.calibration.judging import judged
+from ballfg.learning.calibration.problem import Linear, Problem, Step, population_model, population_settings
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Plain, TrackScore, summary
 from ballfg.progress import Watch, unwatched
@@ -47,8 +49,8 @@ FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candida
 class Fitted:
     """A candidate, calibrated on all fitted tracks: its problem, without judging tracks, and all its steps."""
 
-    problem: calibrate.Problem
-    steps: tuple[calibrate.Step, ...]
+    problem: Problem
+    steps: tuple[Step, ...]
 
 
 class Candidate(Plain):
@@ -96,7 +98,7 @@ def check_enough(fitted: Sequence[str]) -> None:
         raise ValueError(f"kind: auto needs {LEAST} tracks to fit; got {len(fitted)}. Add some, or write calibrate.")
 
 
-def choose_candidate(problem: calibrate.Problem, watch: Watch = unwatched) -> tuple[Choice, dict[str, Fitted]]:
+def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice, dict[str, Fitted]]:
     """Compare the candidates within the fitted tracks of a problem.
 
     Returns: the comparison, and the calibrated candidates by name; those whose estimates fail are left out.
@@ -128,13 +130,13 @@ def choose_candidate(problem: calibrate.Problem, watch: Watch = unwatched) -> tu
         except calibrate.TooManyFailures:  # it, and the richer ones that begin from it, are left out
             break
         last = found[name].steps[-1]
-        model, settings = calibrate.population_model(posed, last), calibrate.population_settings(posed, last)
+        model, settings = population_model(posed, last), population_settings(posed, last)
         noise = calibrate.fitted_noise(posed, model, settings, watch, errors=False)
         scores[name] = _folds(found[name], linear, noise, watch)
     return compared(scores), found
 
 
-def _fitted(problem: calibrate.Problem, watch: Watch) -> tuple[Fitted, calibrate.Linear]:
+def _fitted(problem: Problem, watch: Watch) -> tuple[Fitted, Linear]:
     """A calibration on all fitted tracks, and these tracks as linearised about its last step but one."""
     steps = [calibrate.first_step(problem)]
     while True:
@@ -144,30 +146,28 @@ def _fitted(problem: calibrate.Problem, watch: Watch) -> tuple[Fitted, calibrate
             return Fitted(problem, tuple(steps)), linear
 
 
-def _folds(
-    fitted: Fitted, linear: calibrate.Linear, noise: NoiseEstimate | None, watch: Watch
-) -> tuple[TrackScore | None, ...]:
+def _folds(fitted: Fitted, linear: Linear, noise: NoiseEstimate | None, watch: Watch) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks' forecasts, each by the population of the other folds, with the noise of all."""
     problem, names = fitted.problem, fitted.problem.split.fit
     made: list[tuple[AnalyticModel, Settings]] = []
     for k in range(min(FOLDS, len(names))):
         step = calibrate.advanced(problem, fitted.steps[-2], linear.without(names[k::FOLDS]))
-        settings = calibrate.population_settings(problem, step)
+        settings = population_settings(problem, step)
         if noise is not None:
             own = settings.coefficients
             spreads = {name: factor * own[name] for name, factor in noise.coefficient_factors.items()}
             settings = with_noise(settings, replace(noise.noise, coefficients=spreads))
-        made.append((calibrate.population_model(problem, step), settings))
+        made.append((population_model(problem, step), settings))
     return _judged(problem, made, watch)
 
 
 def _judged(
-    problem: calibrate.Problem, made: Sequence[tuple[AnalyticModel, Settings]], watch: Watch
+    problem: Problem, made: Sequence[tuple[AnalyticModel, Settings]], watch: Watch
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks' forecasts: from the config's share of each, and half-way before and after it."""
     share, longest = problem.config.observed_share, problem.config.horizon
     shares, horizon = (share / 2.0, share, (1.0 + share) / 2.0), NEAR if longest is None else min(NEAR, longest)
-    return calibrate.judged(problem, made, problem.split.fit, shares, horizon, watch)
+    return judged(problem, made, problem.split.fit, shares, horizon, watch)
 
 
 def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:

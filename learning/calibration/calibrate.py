@@ -5,46 +5,46 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import partial
-from itertools import chain
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
-from pydantic import Field
 
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
-from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import (
     Estimate,
-    Estimator,
     Settings,
     Smoother,
-    dataset_settings,
-    dataset_surfaces,
     estimate_noise,
 )
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.configure import usual_settings
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
 from ballfg.estimation.noise.parameters import with_medians, with_noise
-from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.registry import make_estimator
 from ballfg.factors.loss import Loss
-from ballfg.learning.calibration.coefficients import ONE_VIEW, USUAL, Chosen, choose, with_values
-from ballfg.learning.calibration.correction import Correction, doubt_sigmas, set_doubts, with_correction, with_weights
-from ballfg.learning.calibration.groups import Groups, GroupSpin
+from ballfg.learning.calibration.coefficients import Chosen, with_values
+from ballfg.learning.calibration.correction import Correction, doubt_sigmas, with_correction, with_weights
+from ballfg.learning.calibration.groups import GroupSpin
+from ballfg.learning.calibration.judging import score
 from ballfg.learning.calibration.population import Evidence, agreeing, evidence, fit_population
+from ballfg.learning.calibration.problem import (
+    Linear,
+    Problem,
+    Step,
+    TrackFit,
+    plain,
+    population_model,
+    population_settings,
+)
 from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.config.config_file import AUTO
-from ballfg.learning.evaluation import JUDGED, Plain, TrackScore, judge_track
-from ballfg.learning.split import Split, split_tracks, tracks_of
+from ballfg.learning.evaluation import JUDGED
+from ballfg.learning.split import tracks_of
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import Dataset, Track
-from ballfg.tracks.noise import TrackNoise
 
 ROUGHLY: Final = 0.3
 """Tolerance of a correction at least: its weights move slowly along directions that hardly change a prediction."""
@@ -53,92 +53,6 @@ FIRST: Final = 0.75  # s, the part of each track that teaches a correction: late
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
     """More estimates failed than the config allows."""
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A calibration, checked and ready to start; made by `pose`. The estimator's settings are those of `predict`."""
-
-    dataset: Dataset | SightedDataset
-    config: CalibrationConfig
-    model: AnalyticModel
-    chosen: Chosen
-    surfaces: Surfaces
-    settings: Settings
-    split: Split
-    jobs: int
-    groups: Groups | None = None
-    correction: Correction | None = None
-    shown: TrackNoise | None = None  # The noise that the fitted tracks are linearised with; None: the settings'
-
-    @property
-    def linearising(self) -> Settings:
-        """The settings with that noise; priors of coefficients and the noise of spin labels stay.
-
-        A lift that is wrong looks like wrong labels: with wide ones, lift and spin cannot be told apart.
-        """
-        if self.shown is None:
-            return self.settings
-        return with_noise(self.settings, replace(self.shown, coefficients={}, spin_label=None))
-
-
-class TrackFit(Plain):
-    """Posterior of one track's p coefficients, the model's prior included."""
-
-    name: str
-    values: tuple[float, ...]
-    sigmas: tuple[float, ...]
-
-
-class Step(Plain):
-    """One step in plain numbers, which a checkpoint keeps to the last bit. Step 0 only judges the first model."""
-
-    number: int
-    mean: tuple[float, ...]  # (p,) the population's mean: the coefficients of the next model
-    sigma: tuple[float, ...] = ()  # (p,) standard errors of the mean
-    spread: tuple[float, ...] = ()  # (p,) standard deviations between tracks
-    next_track: tuple[float, ...] = ()  # (p,) standard deviations of a new track's coefficients about the mean
-    spins: tuple[GroupSpin, ...] = ()  # The spins of each group, in the order of `Groups.names`; none without groups
-    by_group: dict[str, tuple[float, ...]] = Field(default_factory=dict)
-    """Means by group, in the same order, of the coefficients that differ between groups."""
-    doubts: tuple[tuple[float, ...], ...] = ()
-    """Directions of the uncertainty of a correction's weights; none without a correction."""
-    moved: float | None = None  # Largest move of a mean in this step, in standard errors
-    fits: tuple[TrackFit, ...] = ()  # Posteriors of the tracks that were used
-    skipped: tuple[tuple[str, str], ...] = ()  # Name and reason of each track that was not used
-    scores: tuple[TrackScore | None, ...] = ()
-    """Scores of the judging tracks with the mean of this step; None where a track could not be judged."""
-
-
-@dataclass(frozen=True)
-class Linear:
-    """Fitted tracks, linearised: posteriors, likelihoods without the prior, names and reasons of skipped tracks."""
-
-    fits: tuple[TrackFit, ...]
-    evidences: tuple[Evidence, ...]
-    skipped: tuple[tuple[str, str], ...]
-
-    def without(self, names: Sequence[str]) -> Self:
-        """Without some tracks."""
-        kept = [k for k, fit in enumerate(self.fits) if fit.name not in names]
-        return replace(self, fits=tuple(self.fits[k] for k in kept), evidences=tuple(self.evidences[k] for k in kept))
-
-
-def pose(dataset: Dataset | SightedDataset, model: AnalyticModel, config: CalibrationConfig, jobs: int = 1) -> Problem:
-    """Check a calibration against its data before anything starts; the model has the ball's radius.
-
-    Raises: ValueError: coefficients that the model does not have or the data cannot determine, too few tracks.
-    """
-    if dataset.one_view and (config.kind == AUTO or config.groups is not None):
-        raise ValueError(
-            "groups and kind: auto need positions, or two cameras; one camera's spins hold errors of its depth. Write "
-            "kind: calibrate without groups."
-        )
-    chosen = choose(model, config.coefficients, ONE_VIEW if dataset.one_view else USUAL)
-    split = split_tracks(dataset, config.split, config.seed, needs_spin=chosen.needs_spin)
-    surfaces, settings = dataset_surfaces(dataset), dataset_settings(dataset, model)
-    groups = None if config.groups is None else Groups.of(dataset, config.groups, split.fit)
-    return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs, groups)
 
 
 def with_shown_noise(problem: Problem, watch: Watch = unwatched) -> Problem:
@@ -175,7 +89,7 @@ def pose_correction(
     if noise is None:
         return posed
     # what the calibrated model lacks looks like noise: the correction has the noise about its first step
-    posed, step = replace(posed, shown=noise.noise), Step(number=0, mean=_plain(mean))
+    posed, step = replace(posed, shown=noise.noise), Step(number=0, mean=plain(mean))
     step = advanced(posed, step, linearised(posed, step, watch))
     posed = replace(posed, correction=replace(begun, mean=np.array(step.mean), spins=step.spins))
     shown = fitted_noise(posed, population_model(posed, step), population_settings(posed, step), watch, errors=False)
@@ -201,7 +115,7 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unw
 def first_step(problem: Problem, watch: Watch = unwatched) -> Step:
     """Step 0, where a calibration begins."""
     start = problem.chosen.start if problem.correction is None else problem.correction.mean
-    return with_scores(problem, Step(number=0, mean=_plain(start)), watch)
+    return with_scores(problem, Step(number=0, mean=plain(start)), watch)
 
 
 def with_scores(problem: Problem, step: Step, watch: Watch = unwatched) -> Step:
@@ -218,59 +132,6 @@ def has_converged(config: CalibrationConfig, step: Step) -> bool:
 def has_ended(config: CalibrationConfig, step: Step) -> bool:
     """True if a step is the last one."""
     return has_converged(config, step) or step.number >= config.max_iterations
-
-
-def score(
-    problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
-) -> tuple[TrackScore | None, ...]:
-    """Scores of the judging tracks, in order, by a model with its settings."""
-    config = problem.config
-    horizon = np.inf if config.horizon is None else config.horizon
-    return judged(problem, [(model, settings)], problem.split.judge, (config.observed_share,), horizon, watch)
-
-
-def judged(
-    problem: Problem,
-    made: Sequence[tuple[AnalyticModel, Settings]],
-    names: tuple[str, ...],
-    shares: Sequence[float],
-    horizon: float,
-    watch: Watch,
-) -> tuple[TrackScore | None, ...]:
-    """Scores of the forecasts of some tracks from some shares of each, track after track.
-
-    Args: made: model and settings of each fold of the tracks; one of all tracks is the fold of all.
-    """
-    smoothers = [make_estimator("smoother", model, problem.surfaces, settings) for model, settings in made]
-    of_track = {name: smoothers[k % len(smoothers)] for k, name in enumerate(names)}
-    forecasts, tracks = partial(_forecasts, of_track, shares, horizon), tracks_of(problem.dataset, names)
-    scores = map_tracks(forecasts, tracks, len(names), problem.jobs)
-    return tuple(chain.from_iterable(watch(scores, len(names), "tracks judged")))
-
-
-def _forecasts(
-    smoothers: Mapping[str, Estimator], shares: Sequence[float], horizon: float, track: Track
-) -> list[TrackScore | None]:
-    """Scores of one track's forecasts from each share of it, by its own smoother."""
-    return [judge_track(smoothers[track.name], track, share, horizon) for share in shares]
-
-
-def population_settings(problem: Problem, step: Step) -> Settings:
-    """Settings with the population's distribution of a new track as the prior of each calibrated number."""
-    learned = {name: step.next_track[k] for k, name in problem.chosen.listed}
-    learned |= {} if problem.correction is None else doubt_sigmas(problem.model)
-    settings = replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
-    groups = problem.groups
-    return settings if groups is None else groups.settings(settings, groups.population(step.spins))
-
-
-def population_model(problem: Problem, step: Step) -> AnalyticModel:
-    """The model with the means of a step, and each group's own where coefficients differ between groups."""
-    model = with_values(problem.model, problem.chosen.names, np.array(step.mean))
-    if problem.groups is not None:
-        model.variations = {**model.variations, **problem.groups.variations(step.by_group)}
-    set_doubts(model, step.doubts)
-    return model
 
 
 def fitted_noise(
@@ -333,10 +194,10 @@ def advanced(problem: Problem, last: Step, linear: Linear) -> Step:
             doubts = problem.correction.directions(chosen, population.mean[:size], population.covariance[:size, :size])
     return Step(
         number=last.number + 1,
-        mean=_plain(population.mean[:size]),
-        sigma=_plain(population.sigma[:size]),
-        spread=_plain(population.spread[:size]),
-        next_track=_plain(population.next_track[:size] if next_track is None else next_track),
+        mean=plain(population.mean[:size]),
+        sigma=plain(population.sigma[:size]),
+        spread=plain(population.spread[:size]),
+        next_track=plain(population.next_track[:size] if next_track is None else next_track),
         spins=found,
         doubts=doubts,
         by_group=by_group,
@@ -406,8 +267,4 @@ def _read(estimate: Estimate, chosen: Chosen, about: Array) -> tuple[TrackFit, E
     mean = estimate.coefficients[columns]
     covariance = estimate.coefficient_covariance[np.ix_(columns, columns)]
     found = evidence(mean, covariance, about, chosen.sigma)
-    return TrackFit(name=estimate.name, values=_plain(mean), sigmas=_plain(np.sqrt(np.diag(covariance)))), found
-
-
-def _plain(values: Array) -> tuple[float, ...]:
-    return tuple(values.tolist())
+    return TrackFit(name=estimate.name, values=plain(mean), sigmas=plain(np.sqrt(np.diag(covariance)))), found

@@ -14,8 +14,8 @@ from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.generic import FUNCTIONS, AirCorrection
 from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.files.whole_file import whole_file
-from ballfg.learning.calibration.calibrate import Problem, Step, population_model
 from ballfg.learning.calibration.correction import learned, spans
+from ballfg.learning.calibration.problem import Problem, Step, population_model
 from ballfg.learning.calibration.report import Comparison
 
 matplotlib.use("Agg")

@@ -8,9 +8,10 @@ import numpy as np
 
 from ballfg.checks import aligned
 from ballfg.estimation.noise.estimate import NoiseEstimate
-from ballfg.learning.calibration.calibrate import Problem, Step, has_converged, population_model
+from ballfg.learning.calibration.calibrate import has_converged
 from ballfg.learning.calibration.correction import SCALE, learned, places
 from ballfg.learning.calibration.gain import Gain, gain_of
+from ballfg.learning.calibration.problem import Problem, Step, population_model
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 AXES = ("forward", "across", "up")

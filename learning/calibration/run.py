@@ -27,21 +27,17 @@ from ballfg.learning.calibration.auto import (
     config_of,
 )
 from ballfg.learning.calibration.calibrate import (
-    Problem,
-    Step,
     calibrate,
     fitted_noise,
     has_ended,
-    population_model,
-    population_settings,
-    pose,
     pose_correction,
-    score,
     with_scores,
     with_shown_noise,
 )
 from ballfg.learning.calibration.gain import denser
+from ballfg.learning.calibration.judging import score
 from ballfg.learning.calibration.picture import draw
+from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose
 from ballfg.learning.calibration.report import compare, outcome, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO

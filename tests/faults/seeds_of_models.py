@@ -20,7 +20,7 @@ from ballfg.dynamics import Architecture, build, nominal_model, save_model
 from ballfg.dynamics.networks.fading import Fading
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
-from ballfg.learning.calibration.calibrate import Problem, Step, TrackFit, pose
+from ballfg.learning.calibration.problem import Problem, Step, TrackFit, pose
 from ballfg.learning.calibration.run import write_checkpoint as write_steps
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore

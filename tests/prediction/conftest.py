@@ -2,19 +2,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Belief, Propagator
+from ballfg.prediction.state import World
 
 NEARLY_EXACT = ProcessNoise(acceleration=1e-9, spin=1e-9, contact_velocity=1e-9, contact_spin=1e-9)
 UNCERTAIN = {"flight.drag.k": 0.005, "bounce.restitution.e": 0.004, "bounce.table_height.offset": 0.002}
+FALLING = np.array([0.0, 0.0, 0.3, 3.0, 0.0, -0.5, 0.0, 0.0, 0.0])
+"""A ball above a table, in SI units."""
 SIGMAS = torch.tensor((0.002, 0.003, 0.002, 0.02, 0.03, 0.02, 2.0, 3.0, 2.0), dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(nominal_model("table_tennis").requires_grad_(False), Surfaces(0.0))
 
 
 @pytest.fixture

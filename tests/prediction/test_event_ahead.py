@@ -9,26 +9,20 @@ import pytest
 import torch
 from scipy import stats
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model
-from ballfg.dynamics.compiled.beliefs.course import Scattered
+from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState, Plane, next_contact, plane_crossing
-from ballfg.prediction.event_ahead import PAIRS, EventAhead, Path, event_numbers, normal_points
+from ballfg.prediction.event_ahead import PAIRS, EventAhead, event_numbers
 from ballfg.prediction.forecast import carried_by
 from ballfg.prediction.state import World
 from ballfg.state import POSITION, VZ
-from tests.prediction.conftest import NEARLY_EXACT
+from tests.prediction.conftest import FALLING, NEARLY_EXACT
 
 G = 9.81
 MEAN = np.array([0.0, 0.0, 0.3, 3.0, 0.0, 2.5, 0.0, 0.0, 0.0])
 SIGMAS = np.array([0.01] * 3 + [0.15] * 3 + [20.0] * 3)
 HORIZON, DRAWS, STEPS = 1.0, 4000, 200
-
-
-@pytest.fixture(scope="module")
-def world():
-    return World(nominal_model("table_tennis").requires_grad_(False), Surfaces(0.0))
 
 
 @pytest.fixture(scope="module")
@@ -156,16 +150,6 @@ def test_a_ball_at_rest_meets_nothing(world):
     assert lying.predict(0.5).event("next-contact").probability == 0.0
 
 
-def test_points_stand_for_a_normal():
-    points = normal_points(PAIRS, 20)
-    assert points.mean(axis=0) == pytest.approx(0.0, abs=1e-9)
-    assert points.T @ points / len(points) == pytest.approx(np.eye(20), abs=1e-9)
-    for way in (np.eye(20)[3], np.array([0.6, 0.0, -0.8, *[0.0] * 17])):
-        for quantile in (-1.5, -0.5, 0.5, 1.5):
-            assert (points @ way < quantile).mean() == pytest.approx(stats.norm.cdf(quantile), abs=0.06)
-
-
-FALLING = np.array([0.0, 0.0, 0.3, 3.0, 0.0, -0.5, 0.0, 0.0, 0.0])
 SCENES = {
     "falling": (FALLING, 0.1, Surfaces(0.0), 1.0, (
         "z=0.01,down", "z=0.021,down", "z=0.05,down", "z=0.1,down", "z=0.15,up", "z=0.22,up", "z=0.25,up", "z=0.22",
@@ -216,45 +200,6 @@ def test_probabilities_are_the_shares_of_balls_of_the_belief(scene):
         told, share = ahead.event(text).probability, share_through(states, Plane.parse(text))
         low, high = stats.binom.interval(0.999, count, share) if 0.0 < share < 1.0 else (count * share, count * share)
         assert low <= count * told <= high, (text, told, share)
-
-
-@pytest.mark.parametrize("tilt", [0.01, 0.1, -0.2])
-def test_possible_balls_bounce_on_a_table_that_leans(tilt):
-    """Where every other ball meets it: over a step of 0.08 s it rises or falls by centimetres under a ball."""
-    effects = ("gravity", "drag", "magnus", "restitution", "friction")
-    model = AnalyticModel([*(EFFECTS[name]() for name in effects), EFFECTS["table_tilt"](y=tilt)])
-    start = FALLING + np.array([0.02] * 3 + [0.5] * 3 + [50.0] * 3) * np.random.default_rng(9).standard_normal((100, 9))
-    start[:, 2] += 0.2
-    calm = np.zeros((100, 6, 3)), np.zeros((100, 3)), np.zeros((100, 4))
-    balls = Scattered.of(model.requires_grad_(False), start, 0.08, calm, Surfaces(0.0))
-    times = 0.08 * torch.arange(1, 7, dtype=torch.float64)
-    exact = rollout(model, torch.from_numpy(start), times, Surfaces(0.0)).numpy()
-    assert balls.met[:, -1].min() > 0
-    assert np.abs(balls.states[:, 3::3] - exact)[..., :3].max() < 1e-4
-
-
-@pytest.mark.parametrize("surfaces", [Surfaces(0.0), Surfaces(0.0, -0.76, (-2.0, 0.6, -0.7, 0.7))])
-def test_possible_balls_move_as_every_other_ball_does(world, surfaces):
-    """Fast ones, ones that come to rest in low hops, and ones that fall past the table's end, each without chance."""
-    rng, step, steps = np.random.default_rng(9), 0.08, 12
-    start = FALLING + np.array([0.1] * 3 + [2.0] * 3 + [100.0] * 3) * rng.standard_normal((400, 9))
-    start[::4, 2:6] *= [0.1, 0.1, 0.1, 0.0]
-    start[:, 2] = np.abs(start[:, 2]) + 0.03
-    calm = np.zeros((400, steps, 3)), np.zeros((400, 3)), np.zeros((400, 4))
-    balls = Scattered.of(world.model, start, step, calm, surfaces)
-    times = step * torch.arange(1, steps + 1, dtype=torch.float64)
-    exact = rollout(world.model, torch.from_numpy(start), times, surfaces).numpy()
-    assert balls.times[:, 3::3] == pytest.approx(np.tile(times, (400, 1)))
-    off = np.abs(balls.states[:, 3::3] - exact)
-    assert off[..., :3].max() < 1e-3
-    assert np.quantile(off[..., 3:6].max(axis=(1, 2)), 0.98) < 0.02  # the others bounce right at the end of a step
-    before, left, bounced = balls.states[:, 1::3], balls.states[:, 2::3], np.diff(balls.met[:, ::3], axis=1) == 1
-    assert bounced.sum() > 300
-    bounced &= left[..., VZ] > 0.0  # else at rest by the end of the step
-    impact = world.model.after_bounce(torch.from_numpy(before[bounced])).numpy()
-    assert left[bounced] == pytest.approx(impact, abs=2e-3)
-    if surfaces.floor_height is None:
-        assert balls.states[..., 2].min() > 0.01  # no moment lies below the table
 
 
 @pytest.mark.parametrize("floor", [-0.76, None])
@@ -381,38 +326,6 @@ def test_a_crossing_near_a_bounce_holds_the_balls_on_both_sides(world, fallen, p
     assert own[[1, 3, 4, 5]] == pytest.approx(about[[1, 3, 4, 5]], rel=0.15)
     assert own[[0, 2]] == pytest.approx(about[[0, 2]], rel=0.2, abs=1.5e-3)  # rollouts by half a millisecond
     assert found.time_sigma == pytest.approx(np.sqrt(np.square(when - found.time).mean()), rel=0.15)
-
-
-@pytest.mark.parametrize("mean", [[0.0, 0.0, 9.0, 3.0, 0.5, 1.0, 0.0, 0.0, 0.0], FALLING])
-def test_possible_balls_have_the_noise_of_the_motion(world, mean):
-    """In flight, and after a bounce: an exactly known ball is as uncertain as its prediction later."""
-    noise = ProcessNoise(acceleration=0.1, contact_velocity=0.05, contact_tangential=0.1)
-    ball = BallState(0.0, np.array(mean), 1e-16 * np.eye(9), (), World(world.model, Surfaces(0.0), noise))
-    balls = Path(ball, carried_by(ball), 0.48).possible
-    there = ball.predict(0.48, 0.48)
-    spread = balls.states[:, -1, :6].std(axis=0)
-    assert spread[:3] == pytest.approx(there.sigmas[-1], rel=0.1)
-    assert spread[3:] == pytest.approx(np.sqrt(np.diagonal(there.covariances[-1]))[3:6], rel=0.15)
-    assert np.unique(balls.met[:, -1]).tolist() == [float(mean is FALLING)]
-
-
-def test_possible_balls_have_the_noise_of_the_motion_from_the_first_steps_on(world):
-    """However far the horizon: white acceleration gives a variance that grows with time, a lasting one with its square.
-
-    A position is off by an eighth at the end of the first step, which has one push.
-    """
-    ball = BallState(
-        0.0,
-        np.array([0.0, 0.0, 50.0, 3.0, 0.5, 1.0, 0.0, 0.0, 0.0]),
-        1e-16 * np.eye(9),
-        (),
-        World(world.model, Surfaces(0.0), ProcessNoise(acceleration=0.1)),
-    )
-    balls = Path(ball, carried_by(ball), 3.0).possible
-    for moment in (3, 6, 15, 30):
-        t = float(balls.times[0, moment])
-        there = np.sqrt(np.diagonal(ball.predict(t, t).covariances[-1]))[:6]
-        assert balls.states[:, moment, :6].std(axis=0) == pytest.approx(there, rel=0.2)
 
 
 def test_a_ball_that_rolls_falls_off_the_end(world):

@@ -27,8 +27,8 @@ from ballfg.estimation.batch import estimate_tracks
 from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import CORRECTED, NOMINAL, Fitted, choose_candidate
-from ballfg.learning.calibration.calibrate import Problem, pose
 from ballfg.learning.calibration.correction import learned
+from ballfg.learning.calibration.problem import Problem, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.split import tracks_of
 from ballfg.simulation import SimulationConfig, write_simulation

@@ -20,8 +20,9 @@ import torch
 from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.estimation import dataset_surfaces
 from ballfg.estimation.configure import fitted_settings
-from ballfg.learning.calibration.calibrate import calibrate, pose, with_shown_noise
+from ballfg.learning.calibration.calibrate import calibrate, with_shown_noise
 from ballfg.learning.calibration.groups import OWN
+from ballfg.learning.calibration.problem import pose
 from ballfg.learning.calibration.sets import Abroad, OneSet
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.tracks import read_dataset, write_dataset

@@ -36,13 +36,8 @@ from ballfg.learning.calibration.auto import (
     Fitted,
     choose_candidate,
 )
-from ballfg.learning.calibration.calibrate import (
-    Problem,
-    fitted_noise,
-    population_model,
-    population_settings,
-    pose,
-)
+from ballfg.learning.calibration.calibrate import fitted_noise
+from ballfg.learning.calibration.problem import Problem, population_model, population_settings, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import log_density

@@ -12,16 +12,9 @@ import pytest
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Smoother, Status
 from ballfg.learning.calibration import calibrate as module, run
-from ballfg.learning.calibration.calibrate import (
-    Problem,
-    Step,
-    TooManyFailures,
-    calibrate,
-    fitted_noise,
-    has_converged,
-    pose,
-)
+from ballfg.learning.calibration.calibrate import TooManyFailures, calibrate, fitted_noise, has_converged
 from ballfg.learning.calibration.coefficients import choose, values_of, with_values
+from ballfg.learning.calibration.problem import Problem, Step, pose
 from ballfg.learning.calibration.report import compare, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_track, summary

@@ -29,16 +29,7 @@ from ballfg.learning.calibration.auto import (
     compared,
     config_of,
 )
-from ballfg.learning.calibration.calibrate import (
-    Problem,
-    Step,
-    calibrate,
-    population_model,
-    population_settings,
-    pose,
-    pose_correction,
-    score,
-)
+from ballfg.learning.calibration.calibrate import calibrate, pose_correction
 from ballfg.learning.calibration.coefficients import Chosen
 from ballfg.learning.calibration.correction import (
     ALL,
@@ -51,8 +42,10 @@ from ballfg.learning.calibration.correction import (
     with_correction,
 )
 from ballfg.learning.calibration.groups import WIDTHS, _widest
+from ballfg.learning.calibration.judging import score
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.population import Evidence
+from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose
 from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import run_calibration
 from ballfg.learning.config.calibration import CalibrationConfig

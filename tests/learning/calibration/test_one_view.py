@@ -15,8 +15,9 @@ from ballfg.estimation.observations.sightings import sighted_track, sightings_of
 from ballfg.factors.batch import COEFFICIENTS
 from ballfg.factors.linear.step import weighted
 from ballfg.learning.calibration import run
-from ballfg.learning.calibration.calibrate import calibrate, pose
+from ballfg.learning.calibration.calibrate import calibrate
 from ballfg.learning.calibration.coefficients import with_values
+from ballfg.learning.calibration.problem import pose
 from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.progress import unwatched

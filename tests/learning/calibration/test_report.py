@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from ballfg.dynamics import nominal_model
-from ballfg.learning.calibration.calibrate import Problem, Step, pose
 from ballfg.learning.calibration.gain import denser, gain_of
+from ballfg.learning.calibration.problem import Problem, Step, pose
 from ballfg.learning.calibration.report import Comparison, outcome, report, table, verdict
 from ballfg.learning.calibration.run import status_of
 from ballfg.learning.config.calibration import CalibrationConfig
