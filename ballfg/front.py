@@ -1,6 +1,7 @@
 """The front door estimates, predicts and diagnoses from arrays, tracks, datasets and folders alike."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -68,7 +69,8 @@ def estimate(
     """Position, velocity and spin of the ball at every stamp, with covariances.
 
     By default, ball, table and noise are those of a track's dataset. A track without a dataset counts as a table-tennis
-    ball above a table at z = 0; the notes of its estimate list signs against that.
+    ball above a table at z = 0, and the scatter of its samples about smooth paths as their noise; the notes of its
+    estimate list signs against that.
 
     Args:
         measured: a track or its arrays, (n, 4) of t, x, y, z in s and m or times (n,) s and positions (n, 3) m; or a
@@ -346,9 +348,23 @@ def estimator_for(
         from ballfg.estimation.configure import fitted_settings
     if surfaces is None:
         surfaces = 0.0 if source is None else dataset_surfaces(source)
-    if settings is None:
-        settings = Settings.for_measured(ball) if source is None else fitted_settings(source, ball, observed)
+    if settings is None and source is not None:
+        settings = fitted_settings(source, ball, observed)
+    elif settings is None:
+        settings = _shown_settings(cast(Track, data), ball)
     return make_estimator(method, ball, surfaces, settings)
+
+
+def _shown_settings(track: Track, ball: BallModel) -> Settings:
+    """The settings of a track without a dataset: its own scatter gives the noise of its positions."""
+    from ballfg.estimation.measurement.position_noise import estimate_position_noise
+
+    settings = Settings.for_measured(ball)
+    states_noise = settings.spins is not None and ball.noise is not None and ball.noise.position is not None
+    if track.sigmas is not None or track.rough or states_noise:
+        return settings
+    x, y, z = estimate_position_noise([track]).tolist()
+    return replace(settings, position_noise=(x, y, z))
 
 
 def _model(model: Model, source: "Tracks | None") -> BallModel:

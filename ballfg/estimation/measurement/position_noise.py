@@ -7,7 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ballfg.arrays import MAD_TO_SIGMA, Array, Mask, median
-from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
+from ballfg.estimation.settings import LEAST_NOISE, Settings, sample_sigmas, total_sigmas
 from ballfg.tracks import Track
 
 HALF_WINDOW = 5  # Largest number of samples on each side of the tested one
@@ -20,7 +20,11 @@ LEAST_CLEAN = 0.1
 ROUNDS = 4  # Repetitions of estimate and rejection; the first one rejects nothing
 ENOUGH = 20_000  # Number of windows that gives sigma to 1 %; no further track is read
 FLOOR = 2e-4  # m. Least noise of a tracker of flying balls; identical or computed positions would give zero
-FALLBACK = 2e-3  # m. Noise of a camera tracker in a room, for data in which no track has a window
+FALLBACK = 2e-3  # m. Noise of a camera tracker in a room: its prior median, and what counts without a window
+FACTOR_FOUR = 1.4  # Standard deviation of a logarithm when only the order of magnitude is known
+MAD_VARIANCE = 1.35
+"""Variance of the logarithm of a robust sigma, times its number of windows: of cubics with white noise, 7 to 80 samples
+at 30 to 200 Hz."""
 MOST_WINDOWS = 0.75  # Share of windows that dropped frames may not make too long; else windows have fewer samples
 LEAST_LEFT = 1e-6
 """Least share of a sample's variance that a fit leaves: a sample far from all others determines the cubic alone."""
@@ -44,17 +48,33 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     the flight.
 
     Args: tracks: read until there are enough windows.
-    Returns: (3,) m, at least `FLOOR`; `FALLBACK` if no track has 7 samples within 0.25 s.
+    Returns: (3,) m, at least `FLOOR`; `FALLBACK` if no track has 7 samples within 0.25 s, or if one bounce may be in
+        all windows of a single track and makes their residuals larger than that.
     """
-    blocks, count = list[Array](), 0
+    blocks, count, size = list[Array](), 0, 0
     for track in tracks:
         blocks.append(_window_residuals(track.seconds, track.positions, np.ones_like(track.positions)))
-        count += len(blocks[-1])
+        count, size = count + len(blocks[-1]), 2 * _half_window(track.seconds) + 1
         if count >= ENOUGH:
             break
-    if count == 0:
-        return np.full(3, FALLBACK)
-    return np.maximum(_robust_sigma(np.concatenate(blocks)), FLOOR)
+    usual = np.full(3, FALLBACK)
+    residuals = np.concatenate([np.empty((0, 2, 3)), *blocks])
+    alone = len(blocks) == 1  # one bounce may be in most windows, or in all
+    if count == 0 or (alone and count <= size and _clean(residuals[:, 1], usual).mean() <= LEAST_CLEAN):
+        return usual
+    return np.maximum(_expected(*_robust_sigma(residuals, usual if alone else None)), FLOOR)
+
+
+def _expected(sigma: Array, count: int) -> Array:
+    """(3,) m, root of the expected variance for a robust sigma (3,) of some windows, each axis by itself.
+
+    The prior of its logarithm is `FACTOR_FOUR` about `FALLBACK`: few windows may lie close to their cubics by chance.
+    """
+    prior = 1.0 / FACTOR_FOUR**2
+    variance = 1.0 / (count / MAD_VARIANCE + prior)
+    shown = np.log(np.maximum(sigma, LEAST_NOISE))
+    mean = variance * (shown * count / MAD_VARIANCE + np.log(FALLBACK) * prior)
+    return np.asarray(np.exp(mean + variance))
 
 
 def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
@@ -73,7 +93,7 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
     if len(residuals) < LEAST_WINDOWS:
         return ()
     usual = median(stated)
-    shown = _robust_sigma(residuals * usual, usual)
+    shown, _ = _robust_sigma(residuals * usual, usual)
     seen, said = (float(np.sqrt(np.square(s).mean())) for s in (shown, usual))
     if seen <= MOST_SCATTER * said:
         return ()
@@ -112,20 +132,21 @@ def _window_residuals(times: Array, positions: Array, sigmas: Array) -> Array:
 
 
 def _half_window(times: Array) -> int:
-    """Number of samples on each side of the tested one: as many as leave most windows no longer than 0.25 s.
+    """Number of samples on each side of the tested one.
 
-    It is `LEAST_HALF_WINDOW` if even these are longer, and 0 for a track without a window.
+    As many as leave more windows than can hold one bounce, and most of them no longer than 0.25 s; else it is
+    `LEAST_HALF_WINDOW`, and 0 for a track without a window.
     """
     if len(times) < 2 * LEAST_HALF_WINDOW + 1:
         return 0
-    for half in range(min(HALF_WINDOW, (len(times) - 1) // 2), LEAST_HALF_WINDOW, -1):
+    for half in range(min(HALF_WINDOW, (len(times) - 2) // 4), LEAST_HALF_WINDOW, -1):
         if (times[2 * half :] - times[: -2 * half] <= LONGEST_WINDOW).mean() > MOST_WINDOWS:
             return half
     return LEAST_HALF_WINDOW
 
 
-def _robust_sigma(residuals: Array, stated: Array | None = None) -> Array:
-    """(3,) m from window residuals (w, 2, 3): MAD of the middle ones, over windows without large residuals.
+def _robust_sigma(residuals: Array, stated: Array | None = None) -> tuple[Array, int]:
+    """(3,) m from window residuals (w, 2, 3): MAD of the middle ones of windows without large ones; their number.
 
     Args: stated: (3,) m. What is large is judged by it first, if some windows have nothing so large: bounces that are
         in most windows do not count as noise then.
@@ -134,12 +155,13 @@ def _robust_sigma(residuals: Array, stated: Array | None = None) -> Array:
     sigma = MAD_TO_SIGMA * median(np.abs(middle))
     if stated is not None and _clean(largest, stated).mean() > LEAST_CLEAN:
         sigma = stated
+    count = len(middle)
     for _ in range(ROUNDS - 1):
         clean = _clean(largest, sigma)
         if not clean.any():
             break
-        sigma = MAD_TO_SIGMA * median(np.abs(middle[clean]))
-    return np.asarray(sigma)
+        sigma, count = MAD_TO_SIGMA * median(np.abs(middle[clean])), int(clean.sum())
+    return np.asarray(sigma), count
 
 
 def _clean(largest: Array, sigma: Array) -> Mask:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.estimation.measurement.position_noise import FACTOR_FOUR
 from ballfg.estimation.noise.linear_filter import Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import Settings
@@ -35,8 +36,6 @@ class Parameter:
     high: float
 
 
-FACTOR_FOUR: Final = 1.4
-"""Standard deviation of a logarithm when only the order of magnitude is known."""
 FACTOR_TWO: Final = 0.7
 """Standard deviation of a logarithm when a number is known to a factor of two."""
 MEMORY_SHARE: Final = 0.4

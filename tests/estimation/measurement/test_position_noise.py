@@ -130,6 +130,41 @@ def test_one_short_track_is_enough_for_an_order_of_magnitude():
     assert np.all((estimate > SIGMA / 2) & (estimate < SIGMA * 2))
 
 
+def opening(rng, n, rate, sigma, bounce):
+    """The beginning of a track, with a bounce at a share of its length; without one for None."""
+    t = np.arange(n) / rate - (9.0 if bounce is None else bounce * n / rate)
+    before = t < 0.0
+    x, z = np.where(before, 4.0, 2.6) * t, np.where(before, -3.0, 2.7) * t - 4.9 * t**2
+    return Track(t, np.stack((x, 0.3 * t, z), axis=1) + rng.normal(0.0, sigma, (n, 3)))
+
+
+@pytest.mark.parametrize(("n", "rate"), [(16, 60.0), (25, 60.0), (26, 100.0), (31, 200.0)])
+@pytest.mark.parametrize("sigma", [0.0005, 0.002, 0.006, 0.02])
+@pytest.mark.parametrize("bounced", [False, True])
+def test_the_opening_of_one_track_shows_its_noise_whether_the_ball_bounced_or_not(n, rate, sigma, bounced):
+    """Most of its windows may hold the bounce. What few windows show is uncertain, and the noise larger for it."""
+    rng = np.random.default_rng(11)
+    bounces = rng.uniform(0.3, 0.7, 40) if bounced else [None] * 40
+    found = [estimate_position_noise([opening(rng, n, rate, sigma, bounce)]) / sigma for bounce in bounces]
+    assert (np.median(found, axis=0) > 0.8).all()
+    assert (np.median(found, axis=0) < 2.2).all()
+    assert (np.quantile(found, 0.75, axis=0) < 3.5).all()
+
+
+def test_a_bounce_in_all_windows_of_the_only_track_is_no_noise():
+    rng = np.random.default_rng(12)
+    for _ in range(20):
+        found = estimate_position_noise([opening(rng, 8, 60.0, 0.0005, bounce=0.45)])
+        assert (found <= FALLBACK).all()
+
+
+def test_the_noise_of_a_few_samples_is_rarely_too_small():
+    """Three windows show less than half of the noise once in six times; the expected variance is seldom so small."""
+    rng = np.random.default_rng(13)
+    found = [estimate_position_noise([opening(rng, 9, 60.0, 0.002, bounce=None)]) / 0.002 for _ in range(200)]
+    assert (np.mean(np.array(found) < 0.5, axis=0) < 0.1).all()
+
+
 def test_reading_stops_when_there_is_enough():
     rng = np.random.default_rng(4)
 
