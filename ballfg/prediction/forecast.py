@@ -170,5 +170,8 @@ def carried_by(start: BallState) -> tuple[Propagator, Belief]:
     Raises: ValueError: a state without a model.
     """
     if start.world is None:
-        raise ValueError("a state must know its model to be predicted; this one does not. Give it one with state.on.")
+        raise ValueError(
+            "a state must know its model to be predicted; this one does not, as where no flight was found. Take one in "
+            "flight, or give it a model with state.on."
+        )
     return Propagator(start.world.surfaces, start.world.process), Belief.of(start.world.model, [start])
