@@ -10,6 +10,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.scatter import StreamScatter
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.live.gate import Gate, Known
@@ -73,6 +74,11 @@ class Ball:
     def last(self) -> float:
         """s, the newest stamp."""
         return self.states[-1].time
+
+    @property
+    def scatter(self) -> StreamScatter | None:
+        """Of its samples, where it gives their noise."""
+        return self._online.scatter
 
     def accepts(self, time: float) -> bool:
         """True if a sample of that stamp can be inserted in its place."""

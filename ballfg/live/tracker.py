@@ -11,6 +11,7 @@ from ballfg.arrays import Array
 from ballfg.checks import as_float, check_array, check_count, check_range
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.scatter import StreamScatter
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.settings import Settings
 from ballfg.live.ball import MISSED, PATIENCE, Ball, BallEvent, Kept, Newcomer
@@ -119,6 +120,8 @@ class Tracker:
         gap: s, after which an unseen ball is dropped.
         confirm: number of consistent samples that make a ball.
         most: largest number of balls at once; positions of further ones are refused.
+        shown_noise: True: positions without sigmas have the noise that the first balls show, not the settings'. None:
+            if no settings are given.
 
     Attributes:
         counts: of the input and its results.
@@ -136,14 +139,15 @@ class Tracker:
         gap: float = GAP,
         confirm: int = CONFIRM,
         most: int = MOST_BALLS,
+        shown_noise: bool | None = None,
     ) -> None:
         self.lag = check_range("lag", lag, 0.0, 10.0)
         self.gap = check_range("gap", gap, 1e-3, 60.0)
         self.confirm = check_count("confirm", confirm, 1, 20)
         self.most = check_count("most", most, 1, 1000)
-        usual = Online(model, surfaces, settings)
+        usual = Online(model, surfaces, settings, shown_noise=shown_noise)
         own = replace(usual.settings, solver=usual.settings.solver or "ballfg")  # in the time that several balls leave
-        self.estimator = Online(usual.model, usual.surfaces, own)
+        self.estimator = Online(usual.model, usual.surfaces, own, shown_noise=usual.shown_noise)
         noise = own.position_scale * np.hypot(own.position_noise, own.memory)
         self.gate = Gate(self.estimator.physics, self.estimator.surfaces.heights(), noise, own.stamp_jitter)
         self.counts = Counts()
@@ -350,9 +354,20 @@ class Tracker:
                 return BallUpdate("refused", frame.time, ball.number, kept.position, reason=reason)
         if displaced is not None:
             self._newcomers.append(Newcomer(displaced, self.gate))
+        if self.estimator.shown_noise and ball.scatter is not None:
+            self._learn(ball.scatter)
         return BallUpdate(
             "state", frame.time, ball.number, kept.position, state, ball.samples, ball.news(), frame.late, reason
         )
+
+    def _learn(self, scatter: StreamScatter) -> None:
+        """Widens the gate to the noise that a ball shows; once it is known, later balls begin with it."""
+        self.gate.noise = np.maximum(self.gate.noise, scatter.sigma**2)
+        if scatter.known:
+            usual = self.estimator
+            x, y, z = scatter.sigma.tolist()
+            own = replace(usual.settings, position_noise=(x, y, z), position_scale=1.0)
+            self.estimator = Online(usual.model, usual.surfaces, own)
 
     def _to_newcomers(self, frame: _Frame) -> None:
         rows, t = frame.open, frame.time

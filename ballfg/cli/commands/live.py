@@ -58,7 +58,8 @@ def live(
     ] = None,
     table: Annotated[float | None, typer.Option(help="Height of the table's surface, m.", show_default="0")] = None,
     noise: Annotated[
-        float | None, typer.Option(help="Standard deviation of a coordinate, m.", show_default="0.0015")
+        float | None,
+        typer.Option(help="Standard deviation of a coordinate, m.", show_default="as the balls show"),
     ] = None,
     out: Annotated[
         Path | None,
@@ -103,7 +104,9 @@ def live(
     inputs.know_observations(observations_file)
     bag = replay is not None and (replay.suffix in (MCAP, SQLITE) or (replay / "metadata.yaml").is_file())
     data = _dataset(like if bag or replay is None else replay)
-    tracker = Tracker(*_scene(data, model, ball, table, noise, group), lag=lag)
+    known, surfaces, settings = _scene(data, model, ball, table, noise, group)
+    stated = noise is not None or (known.noise is not None and known.noise.position is not None)
+    tracker = Tracker(known, surfaces, settings, lag=lag, shown_noise=data is None and not stated)
     with (
         contextlib.closing(_source(replay, bag, listen, idle, speed, topic, data)) as source,
         _output(out, source) as write,

@@ -12,7 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
-from ballfg.checks import as_float, check_array, check_choice, check_count, check_each, check_iterable, is_number, shown
+from ballfg.checks import (
+    as_float,
+    check_array,
+    check_choice,
+    check_count,
+    check_each,
+    check_flag,
+    check_iterable,
+    is_number,
+    shown,
+)
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -22,6 +32,7 @@ from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.online.events import EventTracker, explain, move_contacts, path_of, tell_velocities
 from ballfg.estimation.online.final import Leaving
 from ballfg.estimation.online.newest import Newest, Update
+from ballfg.estimation.online.scatter import StreamScatter
 from ballfg.estimation.online.state import Measurement, OnlineState, Sample, measurements_beside
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import reach_within, warmed_up
@@ -65,10 +76,13 @@ class Online(Estimator):
         budget_ms: that a push may take, on the machine as it is when `warm_up` measures it, or the first push. States
             too old to be linearised anew within it keep their points: with a budget of a few ms spins are a tenth to
             two fifths less accurate, positions and velocities 1 %. None: all states that moved are.
+        shown_noise: True: positions without a sigma have the noise that the stream shows, not the settings'. None: if
+            no settings are given.
 
     Attributes:
         window: the samples, states and factors that are held; None before the first observation.
         reach: number of the newest states that a push may linearise anew; None: all.
+        scatter: of the stream, where it gives the noise; else None.
 
     Raises: ValueError: a lag below 2, time offsets in the settings, or as `Estimator`.
     """
@@ -85,6 +99,7 @@ class Online(Estimator):
         cameras: Sequence[Camera] = (),
         solver: str | None = None,
         budget_ms: float | None = None,
+        shown_noise: bool | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
         if solver is not None:
@@ -107,18 +122,24 @@ class Online(Estimator):
         self.ball = trackwise_model(self.model, self.settings)
         self.physics = physics_of(self.model)
         self.lag = lag
+        self.shown_noise = settings is None if shown_noise is None else check_flag("shown_noise", shown_noise)
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything: the next observation begins a new stream."""
+        self._begin()
+        self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
+        self.scatter = StreamScatter(sample_sigmas(self.settings, 1, None)[0]) if self.shown_noise else None
+        self._leaving: Leaving | None = None  # where someone asks for states that left the window
+        self._origin = StreamOrigin()
+
+    def _begin(self) -> None:
+        """Forgets the window and what explains it."""
         self.window: StreamWindow | None = None
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
         self._undirected: SpinLabel | None = None  # prior of the spin until the launch shows its direction
         self._newest: Newest | None = None  # of the window
-        self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
-        self._leaving: Leaving | None = None  # where someone asks for states that left the window
-        self._origin = StreamOrigin()
 
     def copy(self) -> "Online":
         """An independent estimator with the same observations.
@@ -134,7 +155,7 @@ class Online(Estimator):
             other.window = self.window.copy(other._samples[: len(self.window)])
         other.events = self.events.copy()
         other._newest = None if self._newest is None else self._newest.copy()
-        other._stream = copy.deepcopy(self._stream)
+        other._stream, other.scatter = copy.deepcopy((self._stream, self.scatter))
         other._origin = copy.copy(self._origin)
         return other
 
@@ -159,7 +180,7 @@ class Online(Estimator):
         Args:
             time: s, later than the last.
             position: (3,) m.
-            sigma: (3,) m, its standard deviation; None: the settings'.
+            sigma: (3,) m, its standard deviation; None: the settings', or that of the stream's scatter.
             observations: of this moment, as of a track with this single sample, such as `RadarSpeed(0, 6.2, 0.1)`.
         Returns: the newest state, a copy that later samples do not change.
         Raises: ValueError: if the time does not increase, or a number is not finite.
@@ -169,7 +190,6 @@ class Online(Estimator):
             raise ValueError(
                 f"sigma must be positive and finite, in m; got {shown(sigma)}. Leave it out if it is unknown."
             )
-        spread = sample_sigmas(self.settings, 1, own)[0]
         point = check_array("position", position, remedy="Drop samples without a position.")
         stamp = as_float("time", time) if is_number(time) else float(check_array("time", time, (), "Give it in s."))
         if self._samples and not self._samples[-1].measured:
@@ -178,13 +198,33 @@ class Online(Estimator):
         if self._samples and not since > self._samples[-1].time:
             last = self.stamp_of(self._samples[-1].time)
             raise ValueError(f"time must be finite and increase; got {stamp} s after {last} s. Sort the samples.")
+        scatter = self.scatter if own is None else None
+        spread = sample_sigmas(self.settings, 1, own)[0] if scatter is None else scatter.sigma
         sample = Sample(since, point, spread)
         check_iterable("observations", observations)
         if others := tuple(observations):
             moment = Track(np.array([sample.time]), point[None], spread[None], name="stream", observations=others)
             beside = measurements_beside(moment, self.model, self.settings, spread[None])
             sample.measurements += [measurement for found in beside.values() for _, measurement in found]
-        return replace(self._observe(sample), time=stamp)
+        state = self._observe(sample)
+        if scatter is not None and scatter.take(since, point):
+            state = self._again(spread, scatter.sigma, state)
+        return replace(state, time=stamp)
+
+    def _again(self, before: Array, noise: Array, state: OnlineState) -> OnlineState:
+        """The newest state after all samples with a noise (3,) m had another one.
+
+        The given one, if some of them left the window or pushes have a budget: only later samples have the new noise.
+        """
+        assert self.window is not None
+        if self.window.first > 0 or self.budget_ms is not None:
+            return state
+        samples = self._samples
+        self._begin()
+        for one in samples:
+            stated = noise if one.stated is before else one.stated
+            state = self._observe(Sample(one.time, one.position, stated, measurements=one.measurements))
+        return state
 
     def stamp_of(self, seconds: float) -> float:
         """The stamp on the clock of the stream, s, of a moment that the window counts from its first sample."""
