@@ -45,6 +45,8 @@ class Reading(Observation):
         file: name of the table in the folder of a dataset, with the columns `trajectory`, `t`, those of the values,
             and `sigma`.
         columns: of the values in that table; `dim` of them.
+        periods: in the units of the columns, of those that wrap, such as `{"azimuth": 2 * pi}`; a residual is the
+            shorter way round.
         loss: on the norm of a whitened reading.
 
     Raises: ValueError: a wrong shape, an index that is no whole number, a value that is not finite, a sigma that is not
@@ -52,7 +54,21 @@ class Reading(Observation):
     """
 
     file: ClassVar[str | None]
+    periods: ClassVar[Mapping[str, float]] = {}
     loss: ClassVar[Loss] = Loss("huber", 3.0)
+
+    def __init_subclass__(cls) -> None:
+        """Checks the periods.
+
+        Raises: ValueError: a period of no column, or one that is not positive and finite.
+        """
+        super().__init_subclass__()
+        for column, period in cls.periods.items():
+            if column not in cls.columns or not 0.0 < period < np.inf:
+                raise ValueError(
+                    f"{cls.__name__}.periods must give columns that wrap a positive, finite period; got "
+                    f"{shown(column)}: {period}. Its columns are {', '.join(cls.columns)}."
+                )
 
     def __init__(self, state: ArrayLike, values: ArrayLike, sigma: ArrayLike, delay: ArrayLike | None = None) -> None:
         m, dim = np.size(state), len(self.columns)
@@ -229,7 +245,7 @@ class SpinReading(Reading):
 
 
 class ReadingFactors(FactorBatch):
-    """r = (h(x_i carried over the delay, in free flight) - z_i) / sigma_i."""
+    """r = (h(x_i carried over the delay, in free flight) - z_i) / sigma_i, the shorter way round where z wraps."""
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "values", "sigma", "delay")
 
@@ -265,4 +281,6 @@ class ReadingFactors(FactorBatch):
                 f"{self.sort.__name__}.predicted must return (..., {self.dim}), one number a column; got "
                 f"{tuple(found.shape)} of states {tuple(state.shape)}. Keep the last axis: sum(-1, keepdim=True)."
             )
-        return (found - values) / sigma
+        period = torch.tensor([self.sort.periods.get(column, 0.0) for column in self.sort.columns], dtype=found.dtype)
+        turns = ((found - values) / torch.where(period > 0.0, period, 1.0)).round()
+        return (found - values - period * turns) / sigma
