@@ -64,6 +64,11 @@ def be_quiet() -> None:
     os.environ[VARIABLE] = "1"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun, as `1 track` and `2 tracks`."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def say(line: str) -> None:
     """Prints a line about the course of the work on stderr, unless progress is switched off."""
     _SIGNS.said = time.monotonic()

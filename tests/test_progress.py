@@ -8,7 +8,7 @@ import time
 import pytest
 
 from ballfg import progress as progress_module
-from ballfg.progress import alive, announce, be_quiet, doing, idle, progress, unwatched
+from ballfg.progress import alive, announce, be_quiet, counted, doing, idle, progress, unwatched
 
 
 class Clock:
@@ -113,3 +113,8 @@ def test_a_program_without_stderr_sees_no_progress(clock: Clock, monkeypatch: py
     monkeypatch.setattr(sys, "stderr", None)
     for _ in progress(range(3), 3, "things"):
         clock.now += 10.0
+
+
+@pytest.mark.parametrize(("number", "said"), [(0, "0 tracks"), (1, "1 track"), (2, "2 tracks")])
+def test_a_number_has_its_noun(number: int, said: str) -> None:
+    assert counted(number, "track") == said

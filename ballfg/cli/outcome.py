@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from ballfg.cli.start import NOT_ESTIMATED
-from ballfg.progress import print_notes
+from ballfg.progress import counted, print_notes
 
 if TYPE_CHECKING:
     from ballfg.estimation import Status
@@ -55,11 +55,11 @@ class Outcome:
     def print(self) -> None:
         """Prints the counts of tracks by status, most first, and on stderr the first doubts about their frame."""
         for text, number in self.statuses.most_common():
-            print(f"  {number} track{'s' if number > 1 else ''}: {text}")
+            print(f"  {counted(number, 'track')}: {text}")
         print_notes(self.doubts)
         if self.doubtful > MOST_DOUBTS:
             more = self.doubtful - MOST_DOUBTS
-            print_notes([f"the same doubts about {more} more track{'s' if more > 1 else ''}"])
+            print_notes([f"the same doubts about {counted(more, 'more track')}"])
 
     def end(self) -> None:
         """Ends a command whose output is complete, with a table of the tracks that could not be estimated.
@@ -80,4 +80,4 @@ class Outcome:
         """Prints the share of the tracks outside of a network's training data; nothing without a network."""
         if self.outside:
             mean, text = 100 * self.shares / self.outside, "outside of the network's training data"
-            print(f"  {text}: {mean:.0f} % on average, {self.far} tracks for the greater part")
+            print(f"  {text}: {mean:.0f} % on average, {counted(self.far, 'track')} for the greater part")

@@ -13,6 +13,7 @@ from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.proposal import Proposal, propose
 from ballfg.pages.html import Html, doubtful, items, section, table, tag, typed, whole_page
+from ballfg.progress import counted
 from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
 from ballfg.tracks.dataset import dataset_in_memory
 from ballfg.tracks.info import INFO_FILE
@@ -38,7 +39,7 @@ def page(proposal: Proposal) -> str:
     samples = sum(len(track) for track in proposal.tracks)
     bounce = "" if info.table_height is None else " and bounce on the grey line"
     words = (
-        f"{len(proposal.tracks)} shots, {samples} samples, {info.rate:g} Hz, from {info.source}. "
+        f"{counted(len(proposal.tracks), 'shot')}, {counted(samples, 'sample')}, {info.rate:g} Hz, from {info.source}. "
         f"Balls fly in arcs that open downwards{bounce} if the import is right."
     )
     rows = (

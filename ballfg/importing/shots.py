@@ -15,6 +15,7 @@ from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.names import meanings, says_seen
 from ballfg.importing.stamps import Stamps, as_stamps, joined, missing
+from ballfg.progress import counted
 from ballfg.tracks.track import Label
 
 _DISORDER: Final = 3.0  # median steps: an earlier stamp within this came late; beyond it a new shot begins
@@ -54,11 +55,12 @@ class Counts:
     def notes(self) -> list[str]:
         """One sentence for each kind."""
         said = {
-            f"{self.missing} rows without a time or a position left out": self.missing,
-            f"{self.unseen} rows whose own column says that the ball was not seen left out": self.unseen,
-            f"{self.marks} rows with x = y = z far from their neighbours left out as missing samples": self.marks,
-            f"{self.late} rows put in the order of their times": self.late,
-            f"{self.short} shots of fewer than two samples left out": self.short,
+            f"{counted(self.missing, 'row')} without a time or a position left out": self.missing,
+            f"{counted(self.unseen, 'row')} whose own column says that the ball was not seen left out": self.unseen,
+            counted(self.marks, "row")
+            + " with x = y = z far from their neighbours left out as missing samples": self.marks,
+            f"{counted(self.late, 'row')} put in the order of their times": self.late,
+            f"{counted(self.short, 'shot')} of fewer than two samples left out": self.short,
             f"columns left out: {', '.join(sorted(self.ignored))}": self.ignored,
         }
         return [sentence for sentence, count in said.items() if count]

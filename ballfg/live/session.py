@@ -14,6 +14,7 @@ from ballfg.live.gate import assign
 from ballfg.live.outlook import Outlook, Plane, answer, encoded, look_out, refusal
 from ballfg.live.sources.source import Arrival, Inbox
 from ballfg.live.tracker import BallUpdate, Tracker
+from ballfg.progress import counted
 
 SHORTEST = 1e-3  # ms, the end of the first bin
 STEPS = 200  # Bins per factor of ten: a percentile is right to 1.2 %
@@ -47,8 +48,8 @@ class Latencies:
             return "no lines"
         middle, p99, p999 = (self.percentile(share) for share in (0.5, 0.99, 0.999))
         return (
-            f"latency of {self.count} lines: median {middle:.2f} ms, 99 % {p99:.2f} ms, 99.9 % {p999:.2f} ms, "
-            f"worst {self.worst:.2f} ms"
+            f"latency of {counted(self.count, 'line')}: median {middle:.2f} ms, 99 % {p99:.2f} ms, "
+            f"99.9 % {p999:.2f} ms, worst {self.worst:.2f} ms"
         )
 
 
@@ -149,8 +150,8 @@ class Session:
         counts = self.tracker.counts
         yield str(self.latencies)
         yield (
-            f"{counts.positions} positions, {counts.balls} balls; {counts.late} late, {counts.old} too old, "
-            f"{counts.repeated} repeated, {counts.malformed + self.malformed} malformed, "
+            f"{counted(counts.positions, 'position')}, {counted(counts.balls, 'ball')}; {counts.late} late, "
+            f"{counts.old} too old, {counts.repeated} repeated, {counts.malformed + self.malformed} malformed, "
             f"{self.inbox.dropped + self.inbox.source.lost} dropped"
         )
         rare = {

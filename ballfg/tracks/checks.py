@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ballfg.arrays import Array, median
 from ballfg.checks import shown
+from ballfg.progress import counted
 from ballfg.state import STANDARD_GRAVITY, Z
 
 if TYPE_CHECKING:
@@ -52,12 +53,12 @@ class Findings:
         """One sentence for each kind of repair."""
         notes = []
         if self.repeats:
-            notes.append(f"{self.repeats} exact repeat{'s' * (self.repeats != 1)} dropped")
+            notes.append(f"{counted(self.repeats, 'exact repeat')} dropped")
         if late := len(self.sorted_tracks):
             count = f"{late} trajector{'y' if late == 1 else 'ies'}"
             notes.append(f"rows of {count} were not in time order: sorted ({_some(self.sorted_tracks)})")
         if merged := len(self.merged):
-            what = f"{merged} stamp{'s' * (merged != 1)} with different rows"
+            what = f"{counted(merged, 'stamp')} with different rows"
             most = f"up to {self.merged_distance * 100:.1f} cm apart"
             notes.append(f"{what}, {most}: averaged ({_some(self.merged)})")
         return notes

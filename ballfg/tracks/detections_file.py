@@ -14,6 +14,7 @@ from ballfg.arrays import Array, Index
 from ballfg.checks import LARGEST, NAME_RULE, did_you_mean, is_name, shown
 from ballfg.files.damaged import check_unpacked
 from ballfg.files.spreadsheet import bare
+from ballfg.progress import counted
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.rows import KEY, distinct
@@ -83,7 +84,7 @@ def read_sightings(
     names = texts[KEY][lines]
     notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (*REQUIRED, *OPTIONAL)]
     if nameless := len(texts[KEY]) - len(lines):
-        notes.append(f"{path.name}: {nameless} rows without a trajectory left out")
+        notes.append(f"{path.name}: {counted(nameless, 'row')} without a trajectory left out")
     once = without_repeats((np.unique(names, return_inverse=True)[1], seen_by), values)
     if repeats := len(names) - len(once):
         notes.append(f"{path.name}: {repeats} exact repeats of rows dropped")

@@ -109,7 +109,7 @@ def test_a_service_manager_or_a_closed_terminal_end_a_stream_like_ctrl_c(dataset
         process.send_signal(number)
         _, said = process.communicate()
     assert process.returncode == 0
-    assert b"1 positions" in said
+    assert b"1 position, " in said
 
 
 def test_senders_that_talk_nonsense_and_break_off_do_not_hurt_the_next_ball(dataset: Path) -> None:

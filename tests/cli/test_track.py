@@ -62,7 +62,7 @@ def test_detections_become_a_dataset(rig: Path, tmp_path: Path) -> None:
     out = tmp_path / "shots"
     said = printed("track", table(tmp_path / "detections.csv"), "--cameras", rig, "--out", out)
     assert said.err == ""
-    assert said.out.startswith(f"{out}: 1 tracks of 50 points; wrote dataset.yaml, tracks.csv, detections.csv")
+    assert said.out.startswith(f"{out}: 1 track of 50 points; wrote dataset.yaml, tracks.csv, detections.csv")
     assert "  left: 50 frames, 50 candidates, 50 of them a ball" in said.out
     dataset = read_dataset(out)
     assert (dataset.info.name, dataset.info.table_height, dataset.info.rate) == ("shots", 0.76, 100.0)
@@ -124,7 +124,7 @@ def test_rows_that_stand_twice_count_once(rig: Path, tmp_path: Path) -> None:
     lines = given.read_text().splitlines()
     given.write_text("\n".join([lines[0], *(line for line in lines[1:] for _ in range(2))]) + "\n")
     said = printed("track", given, "--cameras", rig, "--out", tmp_path / "shots")
-    assert "1 tracks of 50 points" in said.out
+    assert "1 track of 50 points" in said.out
     assert "150 exact repeats of rows dropped" in said.err
 
 

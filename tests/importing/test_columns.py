@@ -119,7 +119,7 @@ def test_a_sample_whose_sigma_is_none_is_missing(tmp_path: Path, bad: str) -> No
     rows[7][5] = bad
     proposal = propose(write_rows(tmp_path / "a.csv", "t,x,y,z,sigma_x,sigma_y,sigma_z", rows), Choices())
     np.testing.assert_allclose(proposal.tracks[0].times, np.delete(t, 7), atol=1e-12)
-    assert "1 rows without a time or a position left out" in proposal.notes
+    assert "1 row without a time or a position left out" in proposal.notes
 
 
 @pytest.mark.parametrize(("separator", "sign"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("|", ",")])
@@ -260,8 +260,8 @@ def test_shots_of_one_sample_and_late_samples_are_counted(tmp_path: Path) -> Non
     proposal = propose(write_rows(tmp_path / "a.csv", "shot,t,x,y,z", rows), Choices())
     (track,) = proposal.tracks
     np.testing.assert_allclose(track.positions, p, atol=1e-9)
-    assert "1 rows put in the order of their times" in proposal.notes
-    assert "1 shots of fewer than two samples left out" in proposal.notes
+    assert "1 row put in the order of their times" in proposal.notes
+    assert "1 shot of fewer than two samples left out" in proposal.notes
 
 
 def test_the_drawing_of_a_long_shot_has_few_points() -> None:

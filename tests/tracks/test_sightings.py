@@ -140,7 +140,7 @@ def test_best_candidate_counts_and_the_rest_is_told(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read["a"].pixels, [[3.0, 4.0], [7.0, 8.0]])
     assert notes == [
         "detections.csv: column 'area' ignored",
-        "detections.csv: 1 rows without a trajectory left out",
+        "detections.csv: 1 row without a trajectory left out",
         "detections.csv: 1 candidates with a lower score than another of the same ball left out",
     ]
 
@@ -180,4 +180,4 @@ def test_missing_file_and_nameless_rows(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="must be a table of detections"):
         read_sightings(path, OFFSETS)
     path.write_text("trajectory,t,camera,u,v\n,0,left,1,2\n")
-    assert read_sightings(path, OFFSETS) == ({}, ["detections.csv: 1 rows without a trajectory left out"])
+    assert read_sightings(path, OFFSETS) == ({}, ["detections.csv: 1 row without a trajectory left out"])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from ballfg.cli import inputs
-from ballfg.progress import print_notes
+from ballfg.progress import counted, print_notes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -110,7 +110,7 @@ def design(
         }
         with TableWriter(out) as table:
             table.write(columns)
-        print(f"{out}: {len(plan.settings)} shots")
+        print(f"{out}: {counted(len(plan.settings), 'shot')}")
 
 
 def _stand(

@@ -9,7 +9,7 @@ import typer
 
 from ballfg.cli import inputs
 from ballfg.cli.outcome import Outcome
-from ballfg.progress import print_doubts, progress
+from ballfg.progress import counted, print_doubts, progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,7 +74,7 @@ def estimate(
             rows, hits, flying = rows + result.rows, hits + result.hits, flying + result.flying
     if flying < rows:
         print_doubts([f"{100 * flying // rows} % of the samples are flight; the rest is held, rolls, rests or is lost"])
-    print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
+    print(f"{out}: {counted(rows, 'state')} of {counted(count, 'track')} by {method}; {counted(hits, 'hit')} found")
     outcome.print()
     outcome.print_outside()
     outcome.end()

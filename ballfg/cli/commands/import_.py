@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
 
-from ballfg.progress import idle, print_doubts
+from ballfg.progress import counted, idle, print_doubts
 
 if TYPE_CHECKING:
     from ballfg.importing import Choices
@@ -68,7 +68,8 @@ def import_(
     _show(proposal)
     write_import(out, proposal, cast(Literal["csv", "parquet"], format), force)
     samples = sum(len(track) for track in proposal.tracks)
-    typer.echo(f"wrote {len(proposal.tracks)} shots, {samples} samples to {out}; look at {out / 'import.html'}")
+    wrote = f"{counted(len(proposal.tracks), 'shot')}, {counted(samples, 'sample')}"
+    typer.echo(f"wrote {wrote} to {out}; look at {out / 'import.html'}")
 
 
 def _proposed(sources: list[Path], choices: "Choices") -> "Proposal":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ballfg.cli import inputs
-from ballfg.progress import progress
+from ballfg.progress import counted, progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
@@ -94,7 +94,8 @@ def noise(
     if found is None:
         raise ValueError(f"{dataset} must hold tracks with undisturbed flights of 0.1 s or more; none has one")
     check_known(found, dataset)
-    print(f"{dataset}: noise from {found.tracks} tracks, {found.starts} forecasts of up to 0.3 s in them")
+    forecasts = counted(found.starts, "forecast")
+    print(f"{dataset}: noise from {counted(found.tracks, 'track')}, {forecasts} of up to 0.3 s in them")
     for line in _table(found):
         print(line)
     if assumed == usual:
@@ -119,7 +120,7 @@ def _of_pixels(given: "inputs.Inputs[SightedDataset]", most: int) -> None:
     data = given.dataset
     chosen = spread_over(data, len(data), most)
     smoother = Smoother(given.model, given.surfaces, Settings.for_measured(given.model))
-    print(f"{data.path}: noise of pixels from {len(chosen)} tracks")
+    print(f"{data.path}: noise of pixels from {counted(len(chosen), 'track')}")
     for one in noise_of_sightings(smoother, chosen):
         print(f"  camera {one.camera}, {one.count} sightings")
         rows = zip(STREAK, one.sigmas, one.errors, one.stated, strict=True)

@@ -9,7 +9,7 @@ import typer
 
 from ballfg.cli import inputs
 from ballfg.cli.outcome import Outcome
-from ballfg.progress import print_doubts, print_notes, progress
+from ballfg.progress import counted, print_doubts, print_notes, progress
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -110,6 +110,7 @@ def predict(
         inputs.check_out(out, dataset)
         opened = inputs.open_source(source, dataset, model, effects_file, observe, ball).in_flight(anyway)
         count = len(opened.dataset)
+        seen = f"{counted(count, 'track')}, from the first {observe:g} s of each by {method}"
         estimator = opened.estimator(method, solver, group)
         scales = None
         if conformal is not None:
@@ -119,7 +120,7 @@ def predict(
             scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
         if asked:
             _write_events(table, estimator, opened.dataset, observe, asked, ahead or EVENTS_WITHIN, workers, outcome)
-            print(f"{out}: {outcome.rows} events of {count} tracks, from the first {observe:g} s of each by {method}")
+            print(f"{out}: {counted(outcome.rows, 'event')} of {seen}")
             outcome.tracks.print()
             outcome.tracks.end()
             return
@@ -136,7 +137,7 @@ def predict(
             outcome.add(result, plain.sigmas)
     if scales is None:
         print_doubts(outcome.contradicted(opened.dataset.rough))
-    print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
+    print(f"{out}: {counted(outcome.rows, 'position')} of {seen}")
     outcome.print(observe)
     outcome.tracks.print_outside()
     if scales is not None:

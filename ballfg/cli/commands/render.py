@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
-from ballfg.progress import progress
+from ballfg.progress import counted, progress
 
 if TYPE_CHECKING:
     from ballfg.simulation.scene.config import Clock
@@ -84,7 +84,9 @@ def render(
     write_scene(out, recording, images=images, force=force, watch=progress)
     kind = "images" if images else "a video"
     count = recording.image_count
-    typer.echo(f"wrote {count} frames to {out}: {kind} and stamps for each of {', '.join(names)}; cameras.yaml")
+    typer.echo(
+        f"wrote {counted(count, 'frame')} to {out}: {kind} and stamps for each of {', '.join(names)}; cameras.yaml"
+    )
     typer.echo(f"wrote the truth to {out}: truth.csv, visible.csv, scene.yaml")
 
 

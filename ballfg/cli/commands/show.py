@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.files.whole_file import check_file, whole_file, write_text
-from ballfg.progress import print_doubts, print_notes
+from ballfg.progress import counted, print_doubts, print_notes
 
 if TYPE_CHECKING:
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
@@ -67,7 +67,7 @@ def show(
         all_shots = collect(what, names, limited=False)
         with whole_file(rerun, "rerun") as temporary:
             record(all_shots, temporary)
-        print(f"{rerun}: {len(all_shots.shots)} shots")
+        print(f"{rerun}: {counted(len(all_shots.shots), 'shot')}")
     if out is None and png is None:
         return
     shown = collect(what, names)

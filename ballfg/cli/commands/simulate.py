@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
-from ballfg.progress import progress
+from ballfg.progress import counted, progress
 
 if TYPE_CHECKING:
     from ballfg.simulation.balls import BallKind
@@ -76,7 +76,8 @@ def simulate(
     )
     simulation.write_simulation(out, config, file_format, force=force, watch=progress)
     names = ", ".join(e.name for e in config.undeclared) or "none"
-    typer.echo(f"wrote {tracks} tracks to {out}: tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)")
+    files = f"tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)"
+    typer.echo(f"wrote {counted(tracks, 'track')} to {out}: {files}")
     typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ballfg.progress import print_notes, progress
+from ballfg.progress import counted, print_notes, progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import AnalyticModel, Surfaces
@@ -152,7 +152,9 @@ def track(
                 f"{pipeline.no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(pictures)} there."
             )
         points = sum(len(ball.times) for ball in tracking.balls)
-        print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
+        print(
+            f"{out}: {counted(len(tracking.balls), 'track')} of {counted(points, 'point')}; wrote {', '.join(written)}"
+        )
         print(*pipeline.summary(tracking), sep="\n")
 
 
@@ -219,7 +221,9 @@ def _moving_camera(
         text = "" if court == TABLE_TENNIS else Path(court).read_text(encoding="utf-8")
         written = write_rally(out, info, found.motion, found.shots, found.events, found.strokes, text)
         bounces = sum(event.kind == "bounce" for event in found.events)
-        print(f"{out}: {len(found.strokes)} strokes, {bounces} bounces; wrote {', '.join(written)}")
+        print(
+            f"{out}: {counted(len(found.strokes), 'stroke')}, {counted(bounces, 'bounce')}; wrote {', '.join(written)}"
+        )
 
 
 def _refuse_moving(**options: object) -> None:

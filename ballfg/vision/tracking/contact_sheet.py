@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import drawn
+from ballfg.progress import counted
 from ballfg.vision.arrays import Image
 from ballfg.vision.tracking.overlay import Colour, bgr, by_score, hexadecimal, polyline, ring, uncover
 from ballfg.vision.tracking.pipeline import Tracking
@@ -131,7 +132,7 @@ class ContactSheet:
             self._draw_space(row[-2:], track)
         for panel in panels[-1, -2:]:
             panel.set_xlabel("x, m", size=8)
-        which = f"{count} track{'s' * (count != 1)}" if rows == count else f"{rows} of {count} tracks"
+        which = counted(count, "track") if rows == count else f"{rows} of {count} tracks"
         figure.suptitle(
             f"{which}: the ball in up to {EXPOSURES} frames of each camera, with the points' trail and the sightings. "
             "Right: points with ellipses of 1 sigma from the side and from above; crosses: bounces.",
