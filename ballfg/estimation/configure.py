@@ -22,12 +22,13 @@ from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.noise.estimate import estimate_noise, spread_over
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
-from ballfg.estimation.out_of_distribution import out_of_distribution_share
+from ballfg.estimation.out_of_distribution import out_of_distribution, out_of_distribution_share
+from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.settings import MEASURED, Settings
-from ballfg.estimation.smoother.smoother import PiecewiseSmoother
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.progress import Watch, doing, unwatched
+from ballfg.state import STATE_DIM
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.info import DatasetInfo
 from ballfg.tracks.noise import TrackNoise
@@ -185,8 +186,7 @@ def tracks_settings(
     """
     doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
-    smoother = PiecewiseSmoother(model, surfaces, plain)
-    outside = out_of_distribution_share(model, [smoother.estimate(part).states for part in parts])
+    outside = _share_outside(model, surfaces, plain, parts)
     begun = plain if outside is None else with_usual_noise(plain, model, outside)
     found = estimate_noise(model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch)
     if found is None or outside is None:
@@ -195,6 +195,14 @@ def tracks_settings(
     acceleration = _between(known, shown, outside)
     process = widened(replace(found.settings.process, acceleration=acceleration), model, outside)
     return replace(found.settings, process=process, coefficients={**found.settings.coefficients, **doubts})
+
+
+def _share_outside(model: BallModel, surfaces: Surfaces, settings: Settings, parts: Sequence[Track]) -> float | None:
+    """Share of the flights outside of a network's training data; None without such data."""
+    if out_of_distribution(model, np.zeros((1, STATE_DIM))) is None:
+        return None
+    smoother = make_estimator("smoother", model, surfaces, settings)  # it undoes what the model says of measurement
+    return out_of_distribution_share(model, [smoother.estimate(part).states for part in parts])
 
 
 def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessNoise:

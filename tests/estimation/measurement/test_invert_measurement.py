@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, Coefficient, build
+import ballfg as bf
+from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, Coefficient, build, save_model
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.estimation import Estimate, Settings, Smoother, Status
@@ -17,7 +19,7 @@ from ballfg.estimation.measurement import invert_measurement as through_measurem
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.registry import ESTIMATORS, make_estimator
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate
+from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, write_simulation
 from ballfg.simulation.synthetic import SimulatedTrack
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks.track import SPIN_LABELS
@@ -226,3 +228,18 @@ def test_labels_that_hold_almost_nothing_of_the_spin_say_nothing(plain) -> None:
     wide = make_estimator("smoother", declared(), SURFACES, replace(SETTINGS, spin_prior=1e5)).estimate(bare)
     sigma = np.sqrt(np.diagonal(wide.covariances, axis1=1, axis2=2))
     assert (np.abs(found.states - wide.states) < 0.1 * sigma).all()
+
+
+def test_a_model_file_that_states_no_noise_is_undone_for_a_folder(tmp_path: Path) -> None:
+    """The noise then comes from the tracks, which are first undone themselves."""
+    effects = parse_effects(["frame_tilt.y=0.04"])
+    config = replace(CONFIG, tracks=6, undeclared=effects)
+    write_simulation(tmp_path / "tilted", config)
+    save_model(declared(*effects), tmp_path / "model.yaml")
+    found = bf.estimate(tmp_path / "tilted", model=tmp_path / "model.yaml")
+    for simulated in simulate(config):
+        estimate = found[simulated.track.name]
+        error = estimate.states - simulated.true_states
+        assert np.abs(simulated.track.positions - simulated.true_states[:, POSITION]).max() > 0.03  # as measured
+        for part, sigma in SIGMAS[:2]:
+            assert np.sqrt((error[:, part] ** 2).mean()) < 2.0 * sigma
