@@ -22,6 +22,7 @@ from ballfg.estimation import (
 )
 from ballfg.estimation.batch import estimate_tracks, map_tracks
 from ballfg.estimation.configure import usual_settings
+from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.noise.estimate import NoiseEstimate, spread_over
 from ballfg.estimation.noise.parameters import with_medians, with_noise
 from ballfg.estimation.registry import make_estimator
@@ -144,7 +145,7 @@ def fitted_noise(
     Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
         errors: True to compute error bars, which take several times as long.
     """
-    if not model.measures_plainly or problem.dataset.rough:
+    if problem.dataset.rough:
         return None
     names = problem.split.fit
     tracks = spread_over(tracks_of(problem.dataset, names), len(names))
@@ -227,7 +228,9 @@ def linearised(problem: Problem, last: Step, watch: Watch = unwatched) -> Linear
     priors = {**settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
     settings = replace(settings, coefficients=priors)
     model = with_values(problem.model, chosen.names, about)
-    estimator = Smoother(model, problem.surfaces, settings if groups is None else groups.wide(settings, spins))
+    wide = settings if groups is None else groups.wide(settings, spins)
+    kind = Smoother if model.measures_plainly else partial(InvertMeasurement, Smoother)
+    estimator = kind(model, problem.surfaces, wide)  # without variations: those of groups are found anew
     tracks = tracks_of(problem.dataset, names)
     if problem.correction is not None:
         tracks = (track.opening(FIRST) for track in tracks)
