@@ -72,7 +72,7 @@ def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
     lines = [line for line, _ in found.values()]
     texts = {name: [row[i] for _, row in found.values()] for i, name in enumerate(header) if name != KEY}
     columns = {name: _column(path, name, cells, lines) for name, cells in texts.items()}
-    notes = _set_aside(path, columns, lines)
+    notes = _set_aside(path, columns, lines) + _partial(path, columns)
     return LabelTable(columns, {name: number for number, name in enumerate(found)}, notes)
 
 
@@ -98,6 +98,15 @@ def _set_aside(path: Path, columns: dict[str, list[Label | None]], lines: list[i
             for spin in spins:
                 spin[number] = None
     return notes
+
+
+def _partial(path: Path, columns: dict[str, list[Label | None]]) -> list[str]:
+    """A note on trajectories with some components of the spin: estimators need all three."""
+    spins = [columns[name] for name in SPIN_LABELS if name in columns]
+    rows = list(zip(*spins, strict=True))
+    count = sum(0 < sum(cell is not None for cell in row) < len(SPIN_LABELS) for row in rows)
+    what = f"trajectories with only a part of {','.join(SPIN_LABELS)}: their spin is not used"
+    return [f"{path.name}: {count} of {len(rows)} {what}"] if count else []
 
 
 def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[Label | None]:

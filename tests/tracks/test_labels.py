@@ -23,6 +23,23 @@ def test_tracks_without_a_label_row_are_noted(make_folder):
 
 
 @pytest.mark.parametrize(
+    ("labels", "partial"),
+    [
+        ("trajectory,spin_x,spin_y,spin_z\n000,1,2,3\nb,,2,3\n", 1),
+        ("trajectory,spin_y\n000,2\nb,5\n", 2),
+        ("trajectory,spin_x,spin_y,spin_z\n000,1,2,3\nb,,,\n", 0),
+        ("trajectory,group\n000,spin\nb,none\n", 0),
+    ],
+)
+def test_a_part_of_a_spin_is_noted(make_folder, labels, partial):
+    dataset = read_dataset(make_folder(labels=labels))
+    rest = "trajectories with only a part of spin_x,spin_y,spin_z: their spin is not used"
+    assert dataset.notes == ([f"labels.csv: {partial} of 2 {rest}"] if partial else [])
+    labelled = [track.name for track in dataset if track.spin_label is not None]
+    assert labelled == (["000"] if "spin_x" in labels else [])
+
+
+@pytest.mark.parametrize(
     ("labels", "message"),
     [
         ("", "labels.csv: must begin with a line of column names; got an empty file or line."),
