@@ -31,9 +31,10 @@ class _Stage:
 
 @dataclass
 class _Signs:
-    """The nested stages, the time of the last line, and whether a bar is shown."""
+    """The nested stages, s spent in those that are resumed, the time of the last line, and whether a bar is shown."""
 
     stages: list[_Stage] = field(default_factory=list)
+    spent: dict[str, float] = field(default_factory=dict)
     said: float = 0.0
     covered: int = 0
 
@@ -100,17 +101,24 @@ def print_notes(notes: Iterable[str]) -> None:
 
 
 @contextmanager
-def doing(what: str) -> Iterator[_Stage]:
+def doing(what: str, *, resumed: bool = False) -> Iterator[_Stage]:
     """Names a stage of the work, for `alive`; its text may change on the way.
 
-    Args: what: for instance `compiling machine code`.
+    Args:
+        what: for instance `compiling machine code`.
+        resumed: True for many short stages of this name, also within each other, whose durations are one.
     """
-    stage = _Stage(what, time.monotonic())
+    if resumed and (under_way := [stage for stage in _SIGNS.stages if stage.text == what]):
+        yield under_way[0]
+        return
+    stage = _Stage(what, time.monotonic() - (_SIGNS.spent.get(what, 0.0) if resumed else 0.0))
     _SIGNS.stages.append(stage)
     try:
         yield stage
     finally:
         _SIGNS.stages.remove(stage)
+        if resumed:
+            _SIGNS.spent[what] = time.monotonic() - stage.since
 
 
 @contextmanager

@@ -118,3 +118,20 @@ def test_a_program_without_stderr_sees_no_progress(clock: Clock, monkeypatch: py
 @pytest.mark.parametrize(("number", "said"), [(0, "0 tracks"), (1, "1 track"), (2, "2 tracks")])
 def test_a_number_has_its_noun(number: int, said: str) -> None:
     assert counted(number, "track") == said
+
+
+def test_a_resumed_stage_counts_all_of_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: clock[0])
+    elapsed = []
+    for _ in range(2):
+        with doing("compiling functions", resumed=True) as outer:
+            clock[0] += 3.0
+            with doing("compiling functions", resumed=True) as inner:
+                clock[0] += 2.0
+                elapsed.append(clock[0] - inner.since)
+            assert inner is outer
+        clock[0] += 50.0  # of other work
+    assert elapsed == [5.0, 10.0]
+    with doing("compiling functions") as anew:
+        assert anew.since == clock[0]

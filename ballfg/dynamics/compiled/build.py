@@ -57,7 +57,7 @@ def machine_code(signature: Any, may: Collection[str] = ()) -> Callable[[Callabl
             """The machine code, which numba asks for at the first call from Python."""
             with global_compiler_lock:  # another thread may be here too, and have made it meanwhile
                 if "_compile_for_args" in vars(dispatcher):
-                    with doing("compiling machine code, once on this machine"):
+                    with doing("compiling machine code, once on this machine", resumed=True):
                         entry = dispatcher.compile(signature)
                     dispatcher.disable_compile()  # as of a function whose signature numba is given at once
                     del dispatcher._compile_for_args, dispatcher.get_call_template
