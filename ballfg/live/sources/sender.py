@@ -93,8 +93,10 @@ def _of_json(text: str) -> Sample:
         given = content["positions"]
     elif "position" in content:
         given = [content["position"]]
+    elif missing := [axis for axis in COLUMNS[1:] if axis not in content]:
+        raise ValueError(f"a JSON line must have x, y and z, or position, or positions; it lacks {', '.join(missing)}")
     else:
-        given = [[content.get(axis) for axis in COLUMNS[1:]]]
+        given = [[content[axis] for axis in COLUMNS[1:]]]
     positions = _triples("positions", given)
     if not positions:
         raise ValueError("positions must hold at least one; got none")
