@@ -45,7 +45,7 @@ class Latencies:
 
     def __str__(self) -> str:
         if self.count == 0:
-            return "no lines"
+            return "no line was answered with a state"
         middle, p99, p999 = (self.percentile(share) for share in (0.5, 0.99, 0.999))
         return (
             f"latency of {counted(self.count, 'line')}: median {middle:.2f} ms, 99 % {p99:.2f} ms, "

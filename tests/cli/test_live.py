@@ -216,6 +216,18 @@ def test_an_interrupt_in_the_middle_of_a_sample_keeps_the_recording(
     assert said.endswith("ballfg: interrupted\n")
 
 
+@pytest.fixture
+def tilted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("models") / "tilted.yaml"
+    path.write_text("{flight: {gravity: {}}, bounce: {restitution: {}}, measurement: {frame_tilt: {x: 0.01}}}")
+    return path
+
+
+def test_a_model_with_measurement_effects_is_refused_before_the_stream(tilted: Path) -> None:
+    said = refused("live", "--model", tilted)
+    assert said.startswith("ballfg: error: model must have no measurement effects here: they are undone from whole")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -26,7 +26,7 @@ def test_percentiles_are_right_to_a_bin() -> None:
 def test_what_lies_outside_of_the_scale_is_counted(value: float) -> None:
     latencies = Latencies()
     assert math.isnan(latencies.percentile(0.5))
-    assert str(latencies) == "no lines"
+    assert str(latencies) == "no line was answered with a state"
     latencies.add(value)
     assert latencies.percentile(0.5) <= max(value, 1e-3)
     assert latencies.worst == value

@@ -161,6 +161,11 @@ def _scene(
         torch.set_num_threads(1)
         ball, settings = inputs.model_alone(model, named)
         surfaces = Surfaces.table_tennis(0.0)
+    if not ball.measures_plainly:
+        raise ValueError(
+            "model must have no measurement effects here: they are undone from whole tracks, as estimate and predict "
+            "do. Empty its section measurement."
+        )
     if table is not None:
         surfaces = Surfaces.table_tennis(check_number("table", table, "m", limit=50.0, instead="mm"))
     if noise is not None:
