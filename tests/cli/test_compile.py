@@ -45,5 +45,21 @@ def test_the_balls_that_ship(monkeypatch: pytest.MonkeyPatch) -> None:
     assert printed("compile").out == f"{', '.join(two)}: compiled, and kept in {cache_folder()}\n"
 
 
+def test_a_model_with_measurement_effects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its ball is compiled and exported; the measurement is undone in Python."""
+    monkeypatch.setattr("ballfg.dynamics.known_balls.KNOWN_BALLS", {"table_tennis": KNOWN_BALLS["table_tennis"]})
+    ball = "flight: {gravity: {}, drag: {k: 0.1}}\nbounce: {restitution: {e: 0.9}}\n"
+    plain, tilted = tmp_path / "plain.yaml", tmp_path / "tilted.yaml"
+    plain.write_text(ball)
+    tilted.write_text(ball + "measurement: {frame_tilt: {x: 0.01}}\n")
+    assert f"table_tennis, {tilted}: compiled" in printed("compile", "--model", tilted).out
+    headers = []
+    for model, left_out in ((plain, False), (tilted, True)):
+        said = printed("export", model, "--out", tmp_path / "ball.h")
+        assert ("measurement effects are left out" in said.err) == left_out
+        headers.append((tmp_path / "ball.h").read_text())
+    assert headers[0] == headers[1]
+
+
 def test_a_model_that_is_not_there() -> None:
     assert "none.yaml" in refused("compile", "--model", "none.yaml")

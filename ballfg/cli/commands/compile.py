@@ -48,11 +48,12 @@ def _parts(model: "BallModel") -> list[Callable[[], object]]:
     """The functions of an estimate, a stream and their predictions, with the settings of commands."""
     from ballfg.dynamics import Surfaces
     from ballfg.estimation import Online, Settings, Smoother, estimate_noise
+    from ballfg.estimation.measurement.as_measured import plainly_measured
     from ballfg.estimation.online.warm_up import falling_ball
     from ballfg.estimation.settings import SOLVERS
     from ballfg.tracks import Track
 
-    table = Surfaces.table_tennis(0.0)
+    model, table = plainly_measured(model), Surfaces.table_tennis(0.0)  # measurement effects are undone around it
     settings = Settings.for_measured(model, position_noise=(0.003,) * 3)
     smoother = Smoother(model, table, settings)
     streams = [Online(model, table, replace(settings, solver=solver)) for solver in SOLVERS]
@@ -120,6 +121,8 @@ def export(
     if group is not None and known.spins is not None:
         known = known.for_group(known.spins.by, group)
     print_notes(_shared(known, group))
+    if not known.measures_plainly:
+        print_notes(["measurement effects are left out: the header has true positions, not those as measured"])
     write_text(out, c_header(known, out.stem, settings.process))
     print(f"{out}: {out.stem}_fly, {out.stem}_contact, {out.stem}_predict, {out.stem}_cross_plane")
 
