@@ -4,7 +4,15 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.edges import gap_of, level_below, over_table, stays
+from ballfg.dynamics.compiled.beliefs.edges import (
+    gap_of,
+    level_below,
+    nearest_end,
+    over_table,
+    speed_over,
+    stays,
+    time_to_end,
+)
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import common_steps, meet, times_of
 from ballfg.dynamics.compiled.flight import evaluate, fly_one, glide, law_at, laws_of, only, put, put_all, still
@@ -33,6 +41,33 @@ def place_on(surface, x, xt, level, radius):
     x[2], x[5] = level + offset[0] + radius, 0.0
     for q in range(xt.shape[1]):
         xt[2, q], xt[5, q] = moved[0, q], 0.0
+
+
+@machine_code(REAL(LAWS, LAW, ONE, TWO, REAL, ONE, REAL, ONE))
+def roll_on(laws, rolling, x, xt, left, leftt, level, world):
+    """A ball x (9,) on the surface at a level (m), with tangents (9, d), `left` s later, in place.
+
+    Where it rolls over an end of the table it falls.
+
+    Args: leftt: (d,) tangents of the duration.
+    Returns: time (s) for which it rolled.
+    """
+    place_on(laws.surface, x, xt, level, world[2])
+    tau = time_to_end(rolling, x, left, world) if level == world[0] else left
+    if not tau < left:
+        fly_one(rolling, x, xt, left, leftt, steps_over(abs(left)))
+        return left
+    d = xt.shape[1]
+    at, moved, taut, onward, end = x.copy(), xt.copy(), np.zeros(d), np.zeros(d), np.empty(4)
+    fly_one(rolling, at, moved, tau, taut, 1)
+    nearest_end(at, world, end)
+    speed = speed_over(at, end)
+    for q in range(d):  # it passes the end at that time: d place + speed d tau = 0
+        taut[q] = -(end[0] * moved[0, q] + end[1] * moved[1, q]) / speed
+        onward[q] = leftt[q] - taut[q]
+    fly_one(rolling, x, xt, tau, taut, 1)
+    fly_one(laws.rates, x, xt, left - tau, onward, 1)
+    return tau
 
 
 @machine_code(NOTHING(*GIVEN, *ROLLING, ONE, ONE, REAL, TWO, THREE))
@@ -68,8 +103,7 @@ def advance_step(laws, rolling, x, xt, h, world, times, levels):
     after, aftert, leftt, tau, taut = x.copy(), xt.copy(), np.zeros(d), np.empty(1), np.empty((1, d))
     for contact in range(MAX_CONTACTS + 1):
         if stays(laws.rates, laws.surface, x, level, world):
-            place_on(laws.surface, x, xt, level, world[2])
-            fly_one(rolling, x, xt, left, leftt, steps_over(abs(left)))
+            roll_on(laws, rolling, x, xt, left, leftt, level, world)
             return bounces
         put(after, x)
         put_all(aftert, xt)

@@ -3,7 +3,7 @@
 import numpy as np
 from numba.extending import register_jitable
 
-from ballfg.dynamics.compiled.beliefs.edges import gap_of, is_slow, level_at, level_below, over_table
+from ballfg.dynamics.compiled.beliefs.edges import gap_of, is_slow, level_at, level_below, lies_on, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import (
     fly_together,
@@ -33,7 +33,7 @@ from ballfg.dynamics.compiled.signatures import (
     TWO,
     Law,
 )
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED, steps_over
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, steps_over
 
 NEWTON_STEPS = 30  # Largest number of steps to a plane on a cubic; four are enough
 TIME_TOLERANCE = 1e-9  # of a step, of a crossing on a cubic
@@ -75,12 +75,18 @@ def roll_out(
             put(states[r, j], x[r])
 
 
-@machine_code(NOTHING(LAW, ONE, ONE, REAL, ONE))
-def _push(surface, x, push, h, world):
+@machine_code(FLAG(LAW, ONE, ONE))
+def _lies(surface, x, world):
+    """Whether a ball x (9,) lies on what is below it."""
+    return is_slow(x) and lies_on(surface, x, level_below(surface, x, world), world)
+
+
+@machine_code(NOTHING(ONE, ONE, REAL, FLAG))
+def _push(x, push, h, lies):
     """Changes the velocity of a ball x (9,) as a push (3,) m/s^2 does within h s; at rest it stays on its surface."""
     x[3] += h * push[0]
     x[4] += h * push[1]
-    if not (is_slow(x) and abs(gap_of(surface, x, level_below(surface, x, world), world[2])) <= REST_GAP):
+    if not lies:
         x[5] += h * push[2]
 
 
@@ -257,10 +263,11 @@ def scatter(
     all_laws, grounded = laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws), law_at(rolling, g, gt, wg)
     x, after, bounced = start.copy(), np.empty((m, 9)), np.empty(m, dtype=np.int64)
     none, calm, step, so_far = np.empty((m, 9, 0)), np.zeros((m, 0)), np.full(m, h), np.zeros(m, dtype=np.int64)
-    until, at = np.empty((m, 3)), np.empty((m, 3, 9))
+    until, at, lies = np.empty((m, 3)), np.empty((m, 3, 9)), np.empty(m, dtype=np.bool_)
     for j in range(k):
         for r in range(m):
-            _push(only(all_laws.surface, r), x[r], pushes[r, j], 0.5 * h, worlds[r])
+            lies[r] = _lies(only(all_laws.surface, r), x[r], worlds[r])
+            _push(x[r], pushes[r, j], 0.5 * h, lies[r])
         put_all(after, x)
         fly_together(rates, after, none, c, ct, w, step, calm, 1)
         until[:], bounced[:] = h, 0
@@ -268,7 +275,8 @@ def scatter(
         for r in range(m):
             if bounced[r]:
                 _kick(kicks[(r + so_far[r]) % m], h - until[r, 1], at[r, 1], after[r])
-            _push(only(all_laws.surface, r), after[r], pushes[r, j], 0.5 * h, worlds[r])
+            held = lies[r] or _lies(only(all_laws.surface, r), after[r], worlds[r])  # if it fell, for less than a step
+            _push(after[r], pushes[r, j], 0.5 * h, held)
             for i in range(3):
                 put(nodes[r, j, i], at[r, i] if bounced[r] and i < 2 else after[r])
                 met[r, j, i] = so_far[r] + (bounced[r] if i else 0)

@@ -39,6 +39,11 @@ NEGLIGIBLE: Final = 1e-4
 add 0.05 m/s to a velocity."""
 LEAST_SIGMA: Final = 1e-12  # m. Least standard deviation of a place
 LONGEST_MOTION: Final = 20.0  # s. An untouched ball lies still by then; over a longer interval it stays in place
+OVER_AN_END: Final = 1e-4
+"""m. A rolling ball's centre this far beyond an end of the table falls: the search for a later contact, which is
+accurate to a microsecond where the ball has only just left, then finds it beside the table."""
+END_STEPS: Final = 20
+"""Upper bound on Newton's search for the time at which a rolling ball passes an end; three or four are enough."""
 MAX_CONTACTS: Final = 32
 """In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
 

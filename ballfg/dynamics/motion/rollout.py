@@ -10,7 +10,7 @@ These rules complete the physics:
 - A ball whose centre starts below the table's surface is beside the table; the floor is what it falls on. One that
   starts below the lowest surface by more than `DEEPEST` falls on and on.
 - Whether a ball meets the table is decided by its centre's place over it at the moment of contact; edges are not hit. A
-  ball that rolls over the edge falls from the end of the integration step in which it does.
+  ball that rolls over an end falls from the moment at which its centre is `OVER_AN_END` beyond.
 """
 
 import math
@@ -23,9 +23,19 @@ from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.flight_step import rk4_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly, followed, is_plain
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED, step_count
+from ballfg.dynamics.motion.limits import (
+    END_STEPS,
+    LONGEST_MOTION,
+    MAX_CONTACTS,
+    MIN_SPEED,
+    OVER_AN_END,
+    REST_GAP,
+    REST_SPEED,
+    TIME_TOLERANCE,
+    step_count,
+)
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import VZ, Z
+from ballfg.state import VELOCITY, VZ, Z
 
 
 def is_resting(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
@@ -99,7 +109,7 @@ def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces
         height, landing = next_surface(model, state.detach(), after.detach(), height, ~resting, surfaces)
         if bool(resting.any()):
             part = take_rows(model, resting, len(state))
-            rolled = roll(part, state[resting], remaining[resting], height[resting])
+            rolled = _roll_on(part, state[resting], remaining[resting], height[resting], surfaces)
             after = after.index_put((resting.nonzero()[:, 0],), rolled)
         done = done.index_put((active,), after) if len(active) < len(done) else after
         if not bool(landing.any()):
@@ -109,13 +119,53 @@ def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces
     return done
 
 
+def _roll_on(model: BallModel, state: Tensor, dt: Tensor, height: Tensor, surfaces: Surfaces) -> Tensor:
+    """`roll` of at most one step on surfaces with ends: a ball that rolls over one falls."""
+    rolled = roll(model, state, dt, height)
+    over = (height == surfaces.table_height) & ~_carried(rolled.detach(), surfaces) & (dt.detach() > 0.0)
+    if not bool(over.any()):
+        return rolled
+    part, state, dt, height = take_rows(model, over, len(state)), state[over], dt[over], height[over]
+    tau, longest = dt.detach(), dt.detach()
+    with torch.no_grad():
+        for _ in range(END_STEPS):
+            beyond, speed = _beyond_end(roll(part, state, tau, height), surfaces)
+            before, tau = tau, (tau + (OVER_AN_END - beyond) / speed).clamp(torch.zeros_like(tau), longest)
+            if float((tau - before).abs().max()) < TIME_TOLERANCE:
+                break
+    beyond, speed = _beyond_end(roll(part, state, tau, height), surfaces)
+    tau = tau - (beyond - beyond.detach()) / speed.detach()  # the same time, with its derivatives
+    fallen = fly(part, roll(part, state, tau, height), dt - tau)
+    return rolled.index_put((over.nonzero()[:, 0],), fallen)
+
+
+def _carried(state: Tensor, surfaces: Surfaces) -> Tensor:
+    """(n,) bool: balls that lie on the table stay up."""
+    if surfaces.extent is None:
+        return torch.ones(len(state), dtype=torch.bool, device=state.device)
+    return _beyond_end(state, surfaces)[0] <= OVER_AN_END
+
+
+def _beyond_end(state: Tensor, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
+    """How far (n,) m balls (n, 9) are beyond the end of the table that they are farthest over, and their speed there.
+
+    The speed, m/s outwards, is at least `MIN_SPEED`.
+    """
+    assert surfaces.extent is not None
+    x_low, x_high, y_low, y_high = surfaces.extent
+    x, y, _, vx, vy = state[..., : VELOCITY.start + 2].unbind(-1)
+    beyond, end = torch.stack((x_low - x, x - x_high, y_low - y, y - y_high), dim=-1).max(dim=-1)
+    speed = torch.stack((-vx, vx, -vy, vy), dim=-1).gather(-1, end.unsqueeze(-1))[..., 0]
+    return beyond, speed.clamp_min(MIN_SPEED)
+
+
 def stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -> Tensor:
     """(n,) bool: the ball rests on the surface at `height`, and its weight keeps it there."""
     resting = is_resting(model, state, height)
     if bool(resting.any()):
         with torch.no_grad():
             resting &= model.rates(state)[0][..., Z] <= 0
-        resting &= (height != surfaces.table_height) | surfaces.over_table(state)
+        resting &= (height != surfaces.table_height) | _carried(state, surfaces)
     return resting
 
 

@@ -9,8 +9,18 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs import edges
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import meet, times_of
-from ballfg.dynamics.compiled.flight import fly_one, glide, law_at, laws_of, laws_of_one, only, white_acceleration
-from ballfg.dynamics.compiled.ground import place_on
+from ballfg.dynamics.compiled.flight import (
+    fly_one,
+    glide,
+    law_at,
+    laws_of,
+    laws_of_one,
+    only,
+    still,
+    value_of,
+    white_acceleration,
+)
+from ballfg.dynamics.compiled.ground import place_on, roll_on
 from ballfg.dynamics.compiled.signatures import (
     COUNT,
     FLAG,
@@ -24,6 +34,7 @@ from ballfg.dynamics.compiled.signatures import (
     ROLLING,
     THREE,
     TWO,
+    Law,
 )
 from ballfg.dynamics.motion.limits import BEYOND, NEGLIGIBLE, REST_SPEED
 
@@ -139,7 +150,7 @@ def fly_belief(rates, mean, covariance, h, noise, after, spread):
 
 @machine_code(NOTHING(LAW, LAW, ONE, TWO, REAL, REAL, ONE, REAL, ONE, TWO))
 def roll_belief(surface, rolling, mean, covariance, h, level, noise, radius, after, spread):
-    """`fly_belief` at rest on the surface at a level (m)."""
+    """`fly_belief` at rest on the surface at a level (m), as if it had no ends."""
     d = len(mean)
     jacobian = np.zeros((9, d))
     for i in range(9):
@@ -149,6 +160,50 @@ def roll_belief(surface, rolling, mean, covariance, h, level, noise, radius, aft
     fly_one(rolling, after[:9], jacobian, h, np.zeros(d), 1)
     through(jacobian, covariance, spread)
     add_flight(spread, h, noise)
+
+
+@machine_code(NOTHING(LAWS, LAW, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO))
+def _go_on(laws, rolling, mean, covariance, h, level, world, noise, after, spread):
+    """A neighbour h s later, as if its surface at a level (m) had no ends, or were not there: it rolls on, or flies."""
+    if edges.lies_on(laws.surface, mean[:9], level, world):
+        roll_belief(laws.surface, rolling, mean, covariance, h, level, noise, world[2], after, spread)
+    else:
+        fly_belief(laws.rates, mean, covariance, h, noise, after, spread)
+
+
+@machine_code(NOTHING(LAWS, LAW, ONE, REAL, REAL, REAL, ONE, TWO))
+def _add_end(laws, rolling, x, h, tau, level, world, spread):
+    """Adds to a covariance (d, d) h s later what the uncertain end does to a ball x (9,) that falls after tau s."""
+    at, rolls, falls, moved, end = x.copy(), np.empty(6), np.empty(6), np.zeros((9, 1)), np.empty(4)
+    place_on(still(laws.surface), at, np.empty((9, 0)), level, world[2])
+    glide(rolling, at, tau, 1)
+    value_of(rolling, at, rolls)
+    value_of(laws.rates, at, falls)
+    edges.nearest_end(at, world, end)
+    late = end[3] / edges.speed_over(at, end)  # s
+    for i in range(6):
+        moved[3 + i, 0] = (rolls[i] - falls[i]) * late
+    law = laws.rates
+    along = Law(law.compute, law.c, np.zeros((1, law.c.shape[1], 1)), law.w)
+    fly_one(along, at, moved, h - tau, np.zeros(1), 1)
+    for i in range(9):
+        for j in range(9):
+            spread[i, j] += moved[i, 0] * moved[j, 0]
+
+
+@machine_code(NOTHING(LAWS, LAW, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO))
+def roll_off(laws, rolling, mean, covariance, h, level, world, noise, after, spread):
+    """`roll_belief` on a surface with its ends: where the mean rolls over one it falls."""
+    d = len(mean)
+    jacobian = np.zeros((9, d))
+    for i in range(9):
+        jacobian[i, i] = 1.0
+    after[:] = mean
+    tau = roll_on(laws, rolling, after[:9], jacobian, h, np.zeros(d), level, world)
+    through(jacobian, covariance, spread)
+    add_flight(spread, h, noise)
+    if tau < h:
+        _add_end(laws, rolling, mean[:9], h, tau, level, world, spread)
 
 
 @machine_code(COUNT(*GIVEN, *ROLLING, TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE))
@@ -166,8 +221,9 @@ def carry(
             extent (x_low, x_high, y_low, y_high), the standard deviations of its ends.
         noise (5,): densities of the acceleration (m/s^2/sqrt(Hz)) and the spin (rad/s/sqrt(s)); of an impact along the
             vertical and along the surface (m/s), and of the spin (rad/s).
-    Writes: mean (k + 1, n, d) and covariance (k + 1, n, d, d); for balls that fly on unbounced beside and besides, of
-        the same shapes, the surface's level (k + 1, n) m and age (k + 1, n) s since then, NaN where there is none.
+    Writes: mean (k + 1, n, d) and covariance (k + 1, n, d, d); for balls that fly on unbounced, or roll on beyond an
+        end, beside and besides, of the same shapes, the surface's level (k + 1, n) m and age (k + 1, n) s since then,
+        NaN where there is none.
     Returns: the number of steps done. Where that is less than k, hard (n,) is 1 for balls that have not done the next
         one, since their bounce is not a plain one.
     """
@@ -176,18 +232,23 @@ def carry(
     for k in range(h.shape[1]):
         stop = False
         for r in range(n):
-            x, step, laws = mean[k, r], h[r, k], laws_of_one(all_laws, r)
+            x, step, laws, own = mean[k, r], h[r, k], laws_of_one(all_laws, r), only(grounded, r)
             fly_belief(laws.rates, x, covariance[k, r], step, noise, mean[k + 1, r], covariance[k + 1, r])
             age[k + 1, r] = age[k, r] + step
             if age[k + 1, r] < BEYOND:
-                fly_belief(laws.rates, beside[k, r], besides[k, r], step, noise, beside[k + 1, r], besides[k + 1, r])
                 level[k + 1, r] = level[k, r]
+                _go_on(laws, own, beside[k, r], besides[k, r], step, level[k, r], world, noise,
+                       beside[k + 1, r], besides[k + 1, r])  # fmt: skip
             else:
                 age[k + 1, r] = np.nan
             low, after = edges.level_below(laws.surface, x[:9], world), mean[k + 1, r]
             if edges.stays(laws.rates, laws.surface, x[:9], low, world):
-                own, spread = only(grounded, r), covariance[k + 1, r]
+                spread = covariance[k + 1, r]
                 roll_belief(laws.surface, own, x, covariance[k, r], step, low, noise, world[2], after, spread)
+                if low == world[0] and not edges.carried(after, world):
+                    beside[k + 1, r], besides[k + 1, r] = after, spread
+                    level[k + 1, r], age[k + 1, r] = low, 0.0
+                    roll_off(laws, own, x, covariance[k, r], step, low, world, noise, after, spread)
                 continue
             if after[5] >= 0.0 or edges.gap_of(laws.surface, after[:9], low, world[2]) >= 0.0:
                 continue

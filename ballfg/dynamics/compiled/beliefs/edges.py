@@ -7,8 +7,19 @@ import numpy as np
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import meet, times_of
 from ballfg.dynamics.compiled.flight import glide, put, still, value_of
-from ballfg.dynamics.compiled.signatures import FLAG, LAW, LAWS, ONE, REAL, TWO, Laws
-from ballfg.dynamics.motion.limits import BEYOND, DEEPEST, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
+from ballfg.dynamics.compiled.signatures import FLAG, LAW, LAWS, NOTHING, ONE, REAL, TWO, Laws
+from ballfg.dynamics.motion.limits import (
+    BEYOND,
+    DEEPEST,
+    END_STEPS,
+    LEAST_SIGMA,
+    MIN_SPEED,
+    NEGLIGIBLE,
+    OVER_AN_END,
+    REST_GAP,
+    REST_SPEED,
+    TIME_TOLERANCE,
+)
 from ballfg.dynamics.surfaces import within
 
 
@@ -57,12 +68,63 @@ def is_slow(x):
     return abs(x[5]) <= REST_SPEED / 2
 
 
+@machine_code(FLAG(LAW, ONE, REAL, ONE))
+def lies_on(surface, x, level, world):
+    """Whether a state (9,) lies on the surface at a level (m), which has no ends here."""
+    return is_slow(x) and abs(gap_of(surface, x, level, world[2])) <= REST_GAP
+
+
+@machine_code(NOTHING(ONE, ONE, ONE))
+def nearest_end(x, world, end):
+    """The end of the table that a state (9,) is nearest to, or farthest beyond.
+
+    Writes: to end (4,), x and y of its outward normal; m by which the state is beyond it; m, its standard deviation.
+    """
+    end[2] = -np.inf
+    for k in range(4):
+        out = 1.0 if k == 1 or k == 3 else -1.0
+        beyond = out * ((x[0] if k < 2 else x[1]) - world[3 + k])
+        if beyond > end[2]:
+            end[0], end[1], end[2], end[3] = out if k < 2 else 0.0, 0.0 if k < 2 else out, beyond, world[7 + k]
+
+
+@machine_code(FLAG(ONE, ONE))
+def carried(x, world):
+    """Whether a state (9,) that lies on the table stays up: its centre is not beyond an end."""
+    end = np.empty(4)
+    nearest_end(x, world, end)
+    return end[2] <= OVER_AN_END
+
+
+@machine_code(REAL(ONE, ONE))
+def speed_over(x, end):
+    """m/s, at least `MIN_SPEED`, at which a state (9,) moves out over an end (4,) of the table, as of `nearest_end`."""
+    return max(end[0] * x[3] + end[1] * x[4], MIN_SPEED)
+
+
+@machine_code(REAL(LAW, ONE, REAL, ONE))
+def time_to_end(rolling, x, h, world):
+    """Time (s) after which a ball x (9,) that rolls on the table falls over an end of it; h if not within h s."""
+    at, end = x.copy(), np.empty(4)
+    glide(rolling, at, h, 1)
+    if not h > 0.0 or carried(at, world):
+        return h
+    tau = h
+    for _ in range(END_STEPS):
+        nearest_end(at, world, end)
+        later = min(max(tau + (OVER_AN_END - end[2]) / speed_over(at, end), 0.0), h)
+        if abs(later - tau) < TIME_TOLERANCE:
+            break
+        tau = later
+        put(at, x)
+        glide(rolling, at, tau, 1)
+    return tau
+
+
 @machine_code(FLAG(LAW, LAW, ONE, REAL, ONE))
 def stays(rates, surface, x, level, world):
     """True if a state (9,) rests on the surface at a level (m), and its weight keeps it there."""
-    if not is_slow(x) or (level == world[0] and not over_table(x, world)):
-        return False
-    if not abs(gap_of(surface, x, level, world[2])) <= REST_GAP:
+    if not lies_on(surface, x, level, world) or (level == world[0] and not carried(x, world)):
         return False
     change = np.empty(6)
     value_of(rates, x, change)

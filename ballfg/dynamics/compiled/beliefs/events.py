@@ -4,8 +4,16 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief, roll_belief
-from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past, gap_of, level_below, over_table, stays
+from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief, roll_off
+from ballfg.dynamics.compiled.beliefs.edges import (
+    come_down,
+    falls_past,
+    gap_of,
+    level_below,
+    over_table,
+    stays,
+    time_to_end,
+)
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import fly_one, glide, law_at, laws_of, put, put_all, value_of
 from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, ROLLING, TWO, several
@@ -94,6 +102,23 @@ def _zero(rates, rolling, resting, x, flown, duration, normal, offset, h, earlie
     return np.nan
 
 
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, REAL, ONE, REAL, FLAG, ONE))
+def _first_zero(rates, rolling, resting, x, flown, duration, h, rolls, earliest, normal, offset, either_way, at):
+    """`_zero` of a ball that flies for h s, or that rolls and then may fall over an end of the table.
+
+    Args: duration: s, of `flown`.  rolls: s, for which it rolls.  earliest: s, from which events count.
+    Writes: to at (9,).
+    """
+    until = min(h, rolls)
+    event = _zero(rates, rolling, resting, x, flown, duration, normal, offset, until, earliest, either_way)
+    if until < h and not math.isfinite(event):
+        put(at, x)
+        _move_on(rates, rolling, resting, at, until)
+        left, since = h - until, earliest - until
+        event = until + _zero(rates, rolling, False, at, at, np.inf, normal, offset, left, since, either_way)
+    return event
+
+
 @machine_code(several(REAL, 3)(LAWS, REAL, ONE, ONE, REAL, ONE, ONE))
 def _contact_within(laws, low, x, after, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
@@ -135,11 +160,12 @@ def find(
     grounded = law_at(rolling, g, gt, wg)
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
-        low, resting = level_below(laws.surface, x, world), False
+        low, resting, rolls = level_below(laws.surface, x, world), False, h
         if stays(laws.rates, laws.surface, x, low, world):
             x[2] -= gap_of(laws.surface, x, low, world[2])
             x[5] = 0.0
             tau, past, resting = h, np.nan, True
+            rolls = time_to_end(grounded, x, h, world) if low == world[0] else h
         else:
             fly_belief(laws.rates, mean, covariance, h, noise, after, spread)  # nearly always the whole step
             low, tau, past = _contact_within(laws, low, x, after[:9], h, world, touch)
@@ -150,12 +176,15 @@ def find(
         h = INSTANT if touched else tau
         if not touched and not contact:
             since = earliest - passed
-            event = _zero(laws.rates, grounded, resting, x, after[:9], flown, normal, offset, h, since, either_way)
+            event = _first_zero(
+                laws.rates, grounded, resting, x, after[:9], flown, h, rolls, since, normal, offset, either_way, touch
+            )
         elif not touched and not resting and math.isfinite(low) and passed + h > earliest:
             event = h
         if resting:
             h = event if math.isfinite(event) else h
-            roll_belief(laws.surface, grounded, mean, covariance, h, low, noise, world[2], after, spread)
+            roll_off(laws, grounded, mean, covariance, h, low, world, noise, after, spread)
+            resting = h <= rolls
         elif math.isfinite(low) and not math.isfinite(event):
             if not bounce(laws, x, covariance, h, low, world, noise, after[:9], spread):
                 return HARD, passed

@@ -9,12 +9,21 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.beliefs.carry import add_impact, through
-from ballfg.dynamics.compiled.beliefs.edges import come_down, gap_of, level_below, over_table, share_over_table
+from ballfg.dynamics.compiled.beliefs.edges import (
+    come_down,
+    gap_of,
+    level_below,
+    lies_on,
+    nearest_end,
+    over_table,
+    share_over_table,
+    speed_over,
+)
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import meet
-from ballfg.dynamics.compiled.flight import evaluate, fly_one, laws_of, laws_of_one
+from ballfg.dynamics.compiled.flight import evaluate, fly_one, laws_of, laws_of_one, value_of
 from ballfg.dynamics.compiled.signatures import FLAG, FOUR, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, THREE, TWO, Law, Laws
-from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA, NEGLIGIBLE
+from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA, MIN_SPEED, NEGLIGIBLE, OVER_AN_END
 
 FAR = 4.5
 """Standard deviations of the gap beyond which all balls count as being on one side of a contact. At 4.5, one ball in
@@ -112,6 +121,66 @@ def _past(laws, mean, covariance, level, world):
     return 0.0 if past < NEGLIGIBLE else past
 
 
+@machine_code(NOTHING(LAW, ONE, TWO, FLAG, ONE, ONE, TWO))
+def _fall_past(rates, rolled, rolleds, has_left, world, mean, covariance):
+    """Writes mean (d,) and covariance (d, d) of balls that roll over an end of the table, each at its own moment.
+
+    A ball has fallen for s = T (c + u), if that is positive, with u standard normal.
+
+    Args: rolled (d,), rolleds (d, d): of balls that roll on beyond the end.  has_left: whether the mean has fallen.
+    """
+    d, along, pull, end = len(mean), np.empty(len(mean)), np.empty(6), np.empty(4)
+    nearest_end(rolled[:9], world, end)
+    speed = speed_over(rolled[:9], end)
+    if not speed > MIN_SPEED:
+        return
+    since = (end[2] - OVER_AN_END) / speed
+    for i in range(d):  # covariance with the moment of the fall
+        along[i] = end[0] * (rolleds[i, 0] - since * rolleds[i, 3]) + end[1] * (rolleds[i, 1] - since * rolleds[i, 4])
+        along[i] /= speed
+    variance = end[0] * (along[0] - since * along[3]) + end[1] * (along[1] - since * along[4])
+    variance = variance / speed + (end[3] / speed) ** 2
+    late = math.sqrt(max(variance, LEAST_SIGMA**2))  # T
+    if not abs(since) < FAR * late:
+        return
+    value_of(rates, rolled[:9], pull)
+    c, fall = since / late, pull[2]
+    share, density = math.erfc(-c / math.sqrt(2.0)) / 2.0, math.exp(-c * c / 2.0) / math.sqrt(2.0 * math.pi)
+    first = late * (c * share + density)  # moments of s
+    second = late**2 * ((c * c + 1.0) * share + c * density)
+    third = late**3 * ((c**3 + 3.0 * c) * share + (c * c + 2.0) * density)
+    fourth = late**4 * ((c**4 + 6.0 * c * c + 3.0) * share + (c**3 + 5.0 * c) * density)
+    for i in range(d):
+        mean[i] = rolled[i] + (share * (mean[i] - rolled[i]) if has_left else 0.0)
+        for j in range(d):
+            covariance[i, j] = rolleds[i, j]
+    for i in range(d):  # Stein's lemma: a function of s varies with all else as its mean slope does
+        for row, slope in ((2, first), (5, share)):
+            covariance[i, row] += fall * slope * along[i]
+            covariance[row, i] += fall * slope * along[i]
+    mean[2], mean[5] = rolled[2] + 0.5 * fall * second, fall * first
+    covariance[2, 2] += 0.25 * fall**2 * (fourth - second**2)
+    covariance[2, 5] += 0.5 * fall**2 * (third - first * second)
+    covariance[5, 2] += 0.5 * fall**2 * (third - first * second)
+    covariance[5, 5] += fall**2 * (second - first**2)
+
+
+@machine_code(FLAG(LAWS, REAL, REAL, ONE, TWO, ONE, ONE, TWO, ONE, TWO))
+def _rolls(laws, age, level, beside, besides, world, rolled, rolleds, mean, covariance):
+    """Whether a ball rolls on the table, or has fallen over its end a short while ago; if so writes its moments.
+
+    Args: age, level, beside, besides: of its neighbour.  Writes: to rolled (d,) and rolleds (d, d), too.
+    """
+    fallen = age >= 0.0 and lies_on(laws.surface, beside[:9], level, world)
+    if not (fallen or lies_on(laws.surface, mean[:9], world[0], world)):
+        return False
+    rolled[:], rolleds[:] = mean, covariance
+    if fallen:
+        rolled[:], rolleds[:] = beside, besides
+    _fall_past(laws.rates, rolled, rolleds, fallen, world, mean, covariance)
+    return True
+
+
 @machine_code(NOTHING(REAL, ONE, TWO, ONE, TWO, ONE, TWO))
 def _join(share, above, aboves, below, belows, mean, covariance):
     """Mean (d,) and covariance (d, d) of a mixture with a share of `below`; unchanged if the share is not a number."""
@@ -143,6 +212,9 @@ def mix(
     for time in range(mean.shape[0]):
         for r in range(mean.shape[1]):
             at, spread, c0, low, laws = mean[time, r], covariance[time, r], np.inf, np.nan, laws_of_one(all_laws, r)
+            other, others = beside[time, r], besides[time, r]
+            if _rolls(laws, age[time, r], level[time, r], other, others, world, below, belows, at, spread):
+                continue
             if age[time, r] >= 0.0:
                 low = level[time, r]
                 below[:], belows[:] = beside[time, r], besides[time, r]
