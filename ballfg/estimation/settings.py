@@ -163,16 +163,15 @@ class Settings:
     def for_measured(cls, model: BallModel, **changes: Any) -> "Settings":
         """Settings for measured tracks: the model's coefficients are estimated with each track within their priors.
 
-        Args: model: gives the coefficients and their prior standard deviations; of a model with groups of shots, also
-            their spins and the noise beside which they were found.  changes: other fields; spins=None: without groups.
+        Args: model: gives the coefficients and their prior standard deviations, the noise that its file states, and the
+            spins of its groups of shots.  changes: other fields; spins=None: without that noise and those groups.
         """
         usual: dict[str, Any] = {"coefficients": coefficient_sigmas(model), "process": MEASURED}
-        if model.spins is None or changes.get("spins", model.spins) is None:
-            return cls(**(usual | changes))
+        if model.noise is None or changes.get("spins", model) is None:
+            return cls(**(usual | {"spins": model.spins} | changes))
         from ballfg.estimation.noise.parameters import with_noise  # which needs this module
 
-        settings = cls(**usual, spins=model.spins)
-        return replace(settings if model.noise is None else with_noise(settings, model.noise), **changes)
+        return replace(with_noise(cls(**usual, spins=model.spins), model.noise), **changes)
 
     @property
     def has_memory(self) -> bool:

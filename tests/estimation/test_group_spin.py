@@ -10,7 +10,8 @@ import pytest
 import torch
 
 import ballfg as bf
-from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.cli.inputs import model_alone
+from ballfg.dynamics import Surfaces, nominal_model, save_model
 from ballfg.dynamics.motion.paths import paths
 from ballfg.dynamics.population import SpinGroup, SpinPopulation, launch_axes
 from ballfg.estimation import Online, Settings, Smoother, dataset_settings, predict_tracks
@@ -195,7 +196,16 @@ def test_python_takes_the_groups_of_a_model_as_the_commands_do() -> None:
         np.testing.assert_allclose(spin, known.mean, atol=0.3 * min(known.sigma) + NEAR * 150.0)
 
 
-def test_the_noise_of_a_model_without_groups_is_not_that_of_its_settings() -> None:
+def test_python_takes_the_noise_of_a_model_as_the_commands_do(tmp_path: Path) -> None:
+    """`ballfg live --model` has the noise of the file; so has a robot that loads it, with groups or without."""
     model = nominal_model()
-    model.noise = TrackNoise(memory_time=0.03, acceleration=0.02)
-    assert Settings.for_measured(model) == Settings.for_measured(MODEL)
+    model.noise = TrackNoise(position=(0.004,) * 3, memory_time=0.03, acceleration=0.02)
+    save_model(model, tmp_path / "model.yaml")
+    loaded, command = model_alone(tmp_path / "model.yaml", None)
+    assert Settings.for_measured(loaded) == command
+    assert command.position_noise == (0.004,) * 3
+    assert Settings.for_measured(loaded, spins=None) == Settings.for_measured(MODEL)
+    times = np.arange(20) / 100
+    track = bf.Track(times, np.column_stack((3.0 * times, 0.0 * times, 0.0 * times + 1.0)))
+    own, usual = (bf.estimate(track, model=one).covariances[-1, 1, 1] for one in (loaded, MODEL))
+    assert own > 4.0 * usual
