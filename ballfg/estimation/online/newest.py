@@ -14,7 +14,7 @@ from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Status
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
-from ballfg.estimation.sides.struck import HitDoubt
+from ballfg.estimation.sides.struck import HitDoubt, RestDoubt, beside
 from ballfg.estimation.smoother.motion import FLIGHT
 from ballfg.estimation.smoother.problem import coefficient_means
 from ballfg.factors.linear.definite import definite, variances_positive
@@ -44,11 +44,12 @@ class Newest:
         self.model, self.settings, self.world = owner.model, owner.settings, owner.world
         self.monitor = ContactMonitor(HypothesisModel(owner.ball, owner.surfaces, owner.settings, further))
         self.hit = HitDoubt(owner.settings, owner.events.settings)
+        self.rest = RestDoubt(owner.events.settings)
 
     def copy(self) -> "Newest":
         """The same, which further samples leave as it is."""
         other = copy.copy(self)
-        other.monitor, other.hit = copy.copy(self.monitor), copy.copy(self.hit)
+        other.monitor, other.hit, other.rest = copy.copy(self.monitor), copy.copy(self.hit), copy.copy(self.rest)
         return other
 
     def after(
@@ -57,6 +58,7 @@ class Newest:
         """The state after a new sample, the last one. Args: before: the belief at the one before it, if it counts."""
         contact = self._near_contact(samples, before)
         state = self._state(window, samples[-1], contact, update)
+        state = self._in_doubt_of_rest(state, samples, before)
         return self._in_doubt_of_a_hit(state, samples, None if contact is not None else before)
 
     def joined(self, window: StreamWindow, samples: list[Sample], sighting: Measurement, update: Update) -> OnlineState:
@@ -90,6 +92,29 @@ class Newest:
         dt, measured = sample.time - samples[-2].time, (sample.position, sample.stated, sample.whole)
         joint = self.hit.widened(self.monitor.model, before, dt, measured, (state.mean, state.joint))
         return state if joint is state.joint else replace(state, joint=joint, struck=joint - state.joint)
+
+    def _in_doubt_of_rest(
+        self, state: OnlineState, samples: list[Sample], before: tuple[Array, Array] | None
+    ) -> OnlineState:
+        """The state of a resting ball; where it may have left its surface, the more probable one, widened."""
+        sample = samples[-1]
+        level = sample.motion.rest
+        followed = level is not None or sample.motion is FLIGHT
+        if before is None or not followed or not sample.measured or not possible(state.state):
+            self.rest.reset()
+            return state
+        dt, measured, d = sample.time - samples[-2].time, (sample.position, sample.stated), len(state.mean)
+        if level is None:
+            flying = self.rest.flown(self.monitor.model, dt, measured)
+            return state if flying is None else replace(state, mean=flying[0][:d], joint=flying[1][:d, :d])
+        found = self.rest.step(self.monitor.model, before, dt, measured, level)
+        if found is None:
+            return state
+        chance, near, far = found[0], (state.mean, state.joint), (found[1][:d], found[2][:d, :d])
+        if chance > 0.5:
+            near, far, chance = far, near, 1.0 - chance
+        joint = beside(near, far, chance)
+        return replace(state, mean=near[0], joint=joint, struck=joint - near[1])
 
     def _state(self, window: StreamWindow, sample: Sample, contact: ContactState | None, update: Update) -> OnlineState:
         """The window's belief at the newest sample, or a contact's; without a possible one, that nothing is known."""

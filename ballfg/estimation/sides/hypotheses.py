@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+import torch
 
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.edges import height_below
@@ -19,6 +20,7 @@ from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import PreparedMotion
+from ballfg.dynamics.motion.rollout import roll_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.settings import Settings, stamp_covariance
@@ -101,13 +103,14 @@ class HypothesisModel:
         return PreparedMotion(self.ball, self.width)
 
     @cached_property
-    def _world(self) -> Array:
+    def world(self) -> Array:
+        """(11,) the surfaces, as machine code takes them."""
         return world_of(self.surfaces, self.ball.radius)
 
     def level(self, mean: Array) -> float:
         """m, height of the surface below a ball (d,); -inf where there is none."""
         (above,), _ = self.motion.gaps(mean[None, : self.width], 0.0)
-        return float(height_below(plain(mean), mean[Z] - above - self.ball.radius, self._world))
+        return float(height_below(plain(mean), mean[Z] - above - self.ball.radius, self.world))
 
     def gaps(self, means: Array, level: float) -> tuple[Array, Array]:
         """(n,) m between balls (n, d) and a surface, and its gradients (n, d)."""
@@ -141,6 +144,13 @@ class HypothesisModel:
         """Balls after dt s of free flight, without surfaces."""
         after, jacobian = self.motion.fly(balls.means[:, : self.width], dt)
         return self._predicted(balls, after, jacobian, self.settings.process.flight(np.array([dt])), dt)
+
+    def predict_rest(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
+        """Balls after dt s on the surface at a level (m), as if it had no ends."""
+        states, spans = torch.from_numpy(plain(balls.means[:, : self.width])), torch.full((len(balls),), dt).double()
+        after, jacobian = roll_jacobian(self.ball, states, spans, torch.full_like(spans, level))
+        noise = self.settings.process.flight(np.array([dt]))
+        return self._predicted(balls, after.numpy(), jacobian.numpy(), noise, dt)
 
     def predict_bounce(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
         """Balls after dt s with one bounce on the way, without those that never come down."""
