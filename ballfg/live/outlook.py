@@ -79,9 +79,17 @@ def unusable(state: BallState) -> str:
     variances = np.diagonal(state.joint)
     if not (np.isfinite(state.mean).all() and np.isfinite(variances).all() and (variances >= 0.0).all()):
         return "no prediction: the state is not finite"
-    if float(np.sqrt(variances[VELOCITY]).max()) > VAGUE:
+    if _is_vague(variances):
+        struck = state.struck if isinstance(state, OnlineState) else None
+        if struck is not None and not _is_vague(np.maximum(variances - np.diagonal(struck), 0.0)):
+            return "no prediction: this position is an outlier or follows a hit, as the next ones will tell"
         return f"no prediction: the velocity is not known to {VAGUE:g} m/s yet"
     return ""
+
+
+def _is_vague(variances: Array) -> bool:
+    """Whether predictions carry no information: of a state's variances (d,)."""
+    return float(np.sqrt(variances[VELOCITY]).max()) > VAGUE
 
 
 def _tried(find: Callable[[], EventAhead], what: str, notes: list[str]) -> EventAhead:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ballfg.dynamics import nominal_model
 from ballfg.estimation import Online, Status
 from ballfg.estimation.online.state import OnlineState
 from ballfg.live.outlook import look_out
@@ -64,3 +65,16 @@ def test_what_cannot_be_predicted_says_why(state: OnlineState) -> None:
     nowhere = look_out(replace(state, world=None), 0.5, None)
     assert nowhere.note.startswith("no prediction: ValueError: a state must know its model")
     assert nowhere.bounce is nowhere.apex is nowhere.crossing is None
+
+
+def test_a_sample_off_the_flight_is_named_as_the_reason() -> None:
+    """The velocity was known before it; after an outlier the predictions are back with the next samples."""
+    live, times, notes = Online(nominal_model(), 0.0), np.arange(30) / 100, list[str]()
+    path = np.array([0.0, 0.0, 0.3]) + np.outer(times, [3.0, 0.0, 2.0]) - np.outer(times**2, [0.0, 0.0, 4.905])
+    path += np.random.default_rng(0).normal(0.0, 0.0015, path.shape)
+    path[20] += (0.04, 0.0, 0.05)
+    for time, position in zip(times.tolist(), path, strict=True):
+        notes.append(look_out(live.push(time, position), 0.5, None).note)
+    assert "is an outlier or follows a hit" in notes[20]
+    assert not any(notes[5:20])
+    assert not any(notes[23:])
