@@ -6,6 +6,7 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model, rollout
+from ballfg.dynamics.compiled.beliefs.course import Scattered
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.limits import OVER_AN_END
 from ballfg.dynamics.motion.rollout import _advance
@@ -137,3 +138,23 @@ def test_a_ball_never_bounces_on_the_end_that_it_rolls_over(speed, turn):
     fallen = moved[:, 2] < start[2] - 1e-5
     assert fallen[10:].all()
     assert (np.diff(moved[fallen, 5]) < 0.0).all()
+
+
+def test_possible_balls_roll_together_as_each_does_alone():
+    """Some roll all the time, some over an end, some lie on the floor, others fly or slide."""
+    model = nominal_model("table_tennis").requires_grad_(False)
+    edge, h, steps = Surfaces(0.0, -0.76, (-0.5, 0.5, -0.3, 0.3)), 0.031, 40
+    rng, start = np.random.default_rng(4), np.zeros((60, 9))
+    start[:, :2], start[:, 2] = rng.uniform(-0.4, 0.4, (60, 2)) * (1.0, 0.6), 0.017
+    start[:, 3:5], start[:, 6:] = rng.normal(0.0, 0.5, (60, 2)), rng.normal(0.0, 30.0, (60, 3))
+    start[50:55, 0], start[50:55, 2] = 0.9, 0.017 - 0.76
+    start[55:, 2] += 0.2
+    chance = np.zeros((60, steps, 3)), np.zeros((60, 3)), np.zeros((60, 4))
+    balls = Scattered.of(model, start, h, chance, edge)
+    times = h * torch.arange(1, steps + 1).double()
+    alone = np.stack([rollout(model, torch.from_numpy(one[None]), times, edge)[0].numpy() for one in start])
+    assert (alone[:50, -1, 2] < 0.0).sum() > 10
+    assert np.abs(balls.states[:, 3::3, :3] - alone[..., :3]).max() < 1e-3  # by steps twice as long
+    lying = (alone[:50, :, 5] == 0.0).all(axis=1)
+    assert lying.sum() > 10
+    assert np.abs(balls.states[:50, 3::3] - alone[:50])[lying].max() < 1e-9

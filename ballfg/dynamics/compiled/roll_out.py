@@ -3,7 +3,16 @@
 import numpy as np
 from numba.extending import register_jitable
 
-from ballfg.dynamics.compiled.beliefs.edges import gap_of, is_slow, level_at, level_below, lies_on, over_table
+from ballfg.dynamics.compiled.beliefs.edges import (
+    carried,
+    gap_of,
+    is_slow,
+    level_at,
+    level_below,
+    lies_on,
+    over_table,
+    stays,
+)
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import (
     fly_together,
@@ -15,7 +24,7 @@ from ballfg.dynamics.compiled.flight import (
     put,
     put_all,
 )
-from ballfg.dynamics.compiled.ground import advance_step, advance_still
+from ballfg.dynamics.compiled.ground import advance_step, advance_still, place_on
 from ballfg.dynamics.compiled.signatures import (
     ADDRESS,
     COUNT,
@@ -207,11 +216,40 @@ def _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful):
     return n
 
 
-@machine_code(NOTHING(ADDRESS, LAWS, LAW, TWO, TWO, REAL, TWO, TWO, THREE, COUNTS))
-def _bounce(rates, laws, rolling, x, after, h, worlds, times, nodes, bounced):
+@machine_code(NOTHING(ADDRESS, LAWS, LAW, TWO, TWO, REAL, TWO, COUNTS))
+def _roll_together(address, laws, rolling, x, after, h, worlds, doubtful):
+    """Moves those balls x (m, 9) on for h s that lie on a surface all the time, without passing an end of it.
+
+    Writes: after (m, 9), and doubtful (m,) 0, of these among the doubtful ones.
+    """
+    m, n, none = len(x), 0, np.empty((9, 0))
+    which, at, level = np.empty(m, dtype=np.int64), np.empty((m, 9)), np.empty(m)
+    for r in range(m):
+        if not doubtful[r]:
+            continue
+        surface = only(laws.surface, r)
+        level[n] = level_below(surface, x[r], worlds[r])
+        if stays(only(laws.rates, r), surface, x[r], level[n], worlds[r]):
+            which[n] = r
+            put(at[n], x[r])
+            place_on(surface, at[n], none, level[n], worlds[r, 2])
+            n += 1
+    if n == 0:
+        return
+    own, calm = _rows(rolling, which[:n]), np.empty((n, 9, 0))
+    fly_together(address, at[:n], calm, own.c, own.ct, own.w, np.full(n, h), np.zeros((n, 0)), steps_over(h))
+    for i in range(n):
+        if level[i] != worlds[which[i], 0] or carried(at[i], worlds[which[i]]):
+            put(after[which[i]], at[i])
+            doubtful[which[i]] = 0
+
+
+@machine_code(NOTHING(ADDRESS, ADDRESS, LAWS, LAW, TWO, TWO, REAL, TWO, TWO, THREE, COUNTS))
+def _bounce(rates, rolls, laws, rolling, x, after, h, worlds, times, nodes, bounced):
     """Moves balls x (m, 9), which would be at after (m, 9) in h s without surfaces, through their bounces.
 
-    Balls that bounce once and rise, nearly all, are moved together; the others one by one, by the rules of rollout.
+    Balls that bounce once and rise, or that roll on, nearly all, are moved together; the others one by one, by the
+    rules of rollout.
     Writes: after; times (m, 3) and nodes (m, 3, 9), as a step of `scatter`; bounced (m,), the numbers of bounces.
     """
     m = len(x)
@@ -230,6 +268,7 @@ def _bounce(rates, laws, rolling, x, after, h, worlds, times, nodes, bounced):
         put(nodes[r, 0], touch[i])
         put(nodes[r, 1], left[i])
         times[r, 0] = times[r, 1] = tau[i]
+    _roll_together(rolls, laws, rolling, x, after, h, worlds, doubtful)
     for r in range(m):
         if doubtful[r]:
             bounced[r] = _bounces(
@@ -271,7 +310,7 @@ def scatter(
         put_all(after, x)
         fly_together(rates, after, none, c, ct, w, step, calm, 1)
         until[:], bounced[:] = h, 0
-        _bounce(rates, all_laws, grounded, x, after, h, worlds, until, at, bounced)
+        _bounce(rates, rolling, all_laws, grounded, x, after, h, worlds, until, at, bounced)
         for r in range(m):
             if bounced[r]:
                 _kick(kicks[(r + so_far[r]) % m], h - until[r, 1], at[r, 1], after[r])
