@@ -360,8 +360,7 @@ def _shown_settings(track: Track, ball: BallModel) -> Settings:
     from ballfg.estimation.measurement.position_noise import estimate_position_noise
 
     settings = Settings.for_measured(ball)
-    states_noise = settings.spins is not None and ball.noise is not None and ball.noise.position is not None
-    if track.sigmas is not None or track.rough or states_noise:
+    if track.sigmas is not None or track.rough or ball.states_position_noise:
         return settings
     x, y, z = estimate_position_noise([track]).tolist()
     return replace(settings, position_noise=(x, y, z))

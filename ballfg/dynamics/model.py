@@ -169,6 +169,11 @@ class BallModel(nn.Module, ABC):
         """Whether positions, stamps and spin labels are taken to be written down as they are."""
         return self.measuring is None or self.measuring.measures_plainly
 
+    @property
+    def states_position_noise(self) -> bool:
+        """Whether its file states the noise of measured positions."""
+        return self.noise is not None and self.noise.position is not None
+
     def measured(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, measured positions before noise.
 

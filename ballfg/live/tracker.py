@@ -121,7 +121,7 @@ class Tracker:
         confirm: number of consistent samples that make a ball.
         most: largest number of balls at once; positions of further ones are refused.
         shown_noise: True: positions without sigmas have the noise that the first balls show, not the settings'. None:
-            if no settings are given.
+            if neither settings nor the model's file state it.
 
     Attributes:
         counts: of the input and its results.

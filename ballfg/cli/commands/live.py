@@ -105,8 +105,8 @@ def live(
     bag = replay is not None and (replay.suffix in (MCAP, SQLITE) or (replay / "metadata.yaml").is_file())
     data = _dataset(like if bag or replay is None else replay)
     known, surfaces, settings = _scene(data, model, ball, table, noise, group)
-    stated = noise is not None or (known.noise is not None and known.noise.position is not None)
-    tracker = Tracker(known, surfaces, settings, lag=lag, shown_noise=data is None and not stated)
+    stated = data is not None or noise is not None or known.states_position_noise
+    tracker = Tracker(known, surfaces, settings, lag=lag, shown_noise=not stated)
     with (
         contextlib.closing(_source(replay, bag, listen, idle, speed, topic, data)) as source,
         _output(out, source) as write,

@@ -77,7 +77,7 @@ class Online(Estimator):
             too old to be linearised anew within it keep their points: with a budget of a few ms spins are a tenth to
             two fifths less accurate, positions and velocities 1 %. None: all states that moved are.
         shown_noise: True: positions without a sigma have the noise that the stream shows, not the settings'. None: if
-            no settings are given.
+            neither settings nor the model's file state it.
 
     Attributes:
         window: the samples, states and factors that are held; None before the first observation.
@@ -122,7 +122,8 @@ class Online(Estimator):
         self.ball = trackwise_model(self.model, self.settings)
         self.physics = physics_of(self.model)
         self.lag = lag
-        self.shown_noise = settings is None if shown_noise is None else check_flag("shown_noise", shown_noise)
+        unstated = settings is None and not self.model.states_position_noise
+        self.shown_noise = unstated if shown_noise is None else check_flag("shown_noise", shown_noise)
         self.reset()
 
     def reset(self) -> None:
