@@ -6,7 +6,7 @@ approximation.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -211,6 +211,7 @@ class Batches:
     """The likelihood of all stretches; parts: that of each batch."""
 
     parts: tuple[Likelihood, ...]
+    _known: dict[Noise, tuple[Reduced, list[Local]]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, rows: Sequence[Rows], weights: Sequence[Weights] | None = None) -> "Batches":
@@ -231,6 +232,11 @@ class Batches:
 
     def reduced(self, noise: Noise) -> tuple[Reduced, list[Local]]:
         """First states and random motion integrated out, and what was eliminated in each batch."""
+        if noise not in self._known:
+            self._known[noise] = self._reduced(noise)
+        return self._known[noise]
+
+    def _reduced(self, noise: Noise) -> tuple[Reduced, list[Local]]:
         found = [part.reduced(noise) for part in self.parts]
         order = np.argsort(np.concatenate([part.rows.numbers for part in self.parts]))
         constant, gram = (np.concatenate([getattr(r, name) for r, _ in found])[order] for name in ("constant", "gram"))

@@ -23,6 +23,8 @@ ENOUGH: Final = 0.05
 """Share of what a step of the common unknowns should gain that ends the sizes' steps too: it will change them."""
 LONGEST: Final = 1.5
 """Largest step of the logarithm of a size."""
+Sized = tuple[Batches, Noise]
+"""A likelihood with the sizes of its noise."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Start:
     noise: Noise
     weights: Sequence[Weights] | None = None
 
-    def begun(self, rows: Sequence[Rows]) -> tuple[Batches, Noise]:
+    def begun(self, rows: Sequence[Rows]) -> Sized:
         """The likelihood of rows with these sizes, and the weights of what they leave.
 
         Labels begin with a weight of one: their loss is not convex, and one that a wrong model contradicts would stay
@@ -61,7 +63,7 @@ def settled(
     away: Array,
     starts: Sequence[Start | None] = (None,),
     own: int | None = None,
-) -> tuple[Batches, Noise]:
+) -> Sized:
     """The likelihood with the robust weights and sizes of noise that maximise the evidence at the present unknowns.
 
     Not at those to which it leads: a long step leaves the linear range. There are several maxima: noise that a wrong
@@ -72,8 +74,17 @@ def settled(
         starts: of similar models, or None for almost no noise beside that of the samples; the best end counts.
         own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
     """
-    begun = [(Batches.of(rows), Noise()) if start is None else start.begun(rows) for start in starts]
-    ends = [_climbed(*one, precision, away, own) for one in begun]
+    return climbed([begun(rows, start) for start in starts], precision, away, own)
+
+
+def begun(rows: Sequence[Rows], start: Start | None) -> Sized:
+    """The likelihood and the sizes with which a start, as of `settled`, begins."""
+    return (Batches.of(rows), Noise()) if start is None else start.begun(rows)
+
+
+def climbed(starts: Sequence[Sized], precision: Array, away: Array, own: int | None = None) -> Sized:
+    """As `settled`, from what `begun` gives."""
+    ends = [_climbed(*one, precision, away, own) for one in starts]
     _, likelihood, noise = max(ends, key=lambda end: end[0])
     return likelihood, noise
 

@@ -12,7 +12,7 @@ from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
 from ballfg.diagnosis.evidence.prior import WIDTHS, Priors, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, Rows, random_motion, rows_beside
-from ballfg.diagnosis.evidence.sizes import Start, settled
+from ballfg.diagnosis.evidence.sizes import Sized, Start, begun, climbed
 from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
@@ -152,26 +152,35 @@ def weighed(
     """
     with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
         question, closest = _Question(named, motion, halves, patterns), followed(fit, fit.unknowns)
-        point = question.point(closest if np.isfinite(closest.cost) else fit)
-        found, ahead, density = question.at(point, (like.start, None) if like else (None,))
+        starts = (like.start, None) if like else (None,)
+        point = question.point(closest if np.isfinite(closest.cost) else fit, starts)
+        found, ahead, density = question.at(point)
         if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
-            return question.at(point, (found.start,), found.widths)[0]
+            return question.at(point.begun_at((found.start,)), found.widths)[0]
         for _ in range(MOST_STEPS):
             moved = question.moved(point, found, ahead, density)
             if moved is None:
                 break
             point, damping = moved
-            found, ahead, density = question.at(point, (found.start,), damping=damping)
+            found, ahead, density = question.at(point, damping=damping)
         return found.without(ahead.gain) if ahead.gain > WORTH_A_STEP else found
 
 
 @dataclass(frozen=True)
 class _Point:
-    """A fit with its rows, beside patterns without a name if the question has them, and the priors there."""
+    """A fit with its rows, beside patterns without a name if the question has them, and the priors there.
+
+    Its noise is sought from the sizes with which the starts, as of `settled`, begin.
+    """
 
     fit: Fit
     rows: Sequence[Rows]
     priors: Priors
+    starts: Sequence[Sized] = ()
+
+    def begun_at(self, starts: Sequence[Start | None]) -> "_Point":
+        """The point with these starts."""
+        return replace(self, starts=[begun(self.rows, start) for start in starts])
 
     @property
     def own(self) -> int:
@@ -193,26 +202,21 @@ class _Question:
         """Whether there are patterns without a name."""
         return self.patterns is not None
 
-    def point(self, fit: Fit) -> _Point:
+    def point(self, fit: Fit, starts: Sequence[Start | None]) -> _Point:
         fit = with_guesses(fit)
         rows = rows_beside(fit, self.motion, self.patterns)
-        return _Point(fit, rows, Priors.of(fit, self.named, self.patterns))
+        return _Point(fit, rows, Priors.of(fit, self.named, self.patterns)).begun_at(starts)
 
-    def at(
-        self, point: _Point, starts: Sequence[Start | None], widths: Sequence[int] = (), damping: float = 0.0
-    ) -> tuple[Weighed, Ahead, float]:
+    def at(self, point: _Point, widths: Sequence[int] = (), damping: float = 0.0) -> tuple[Weighed, Ahead, float]:
         """The model at the unknowns of a point, the way to more probable ones, and the density as in `_density`.
 
-        Args:
-            starts: as in `settled`.
-            widths: of the effects, then of the patterns, of a similar model.
-            damping: of the next step.
+        Args: widths: of the effects, then of the patterns, of a similar model.  damping: of the next step.
         """
-        fit, rows, priors = point.fit, point.rows, point.priors
+        fit, priors = point.fit, point.priors
         own, effects = point.own, [h for h in self.named if h.strengths]
         of_patterns = list(widths[len(effects) :]) or [0] * (len(priors.places) - len(effects))
         first = priors.precision([len(WIDTHS) - 1] * len(effects) + of_patterns)
-        likelihood, noise = settled(rows, first, priors.away, starts, own)
+        likelihood, noise = climbed(point.starts, first, priors.away, own)
         total = likelihood.reduced(noise)[0].by_track(fit.problem.stretches.track)
         whole = total.of(np.full(len(self.halves), True))
         best, mixed = priors.widths(whole)
@@ -256,19 +260,20 @@ class _Question:
             if promised < WORTH_A_STEP:
                 return None
             fit = followed(point.fit, point.fit.stepped(step))
-            density = self._density(after := self.point(fit), model) if np.isfinite(fit.cost) else -np.inf
+            after = self.point(fit, (model.start,)) if np.isfinite(fit.cost) else None
+            density = -np.inf if after is None else self._density(after, model.widths)
             share = (density - before) / promised
-            if share > HARDLY:
+            if after is not None and share > HARDLY:
                 return after, next_damping(damping, share)
             damping = max(FIRST_DAMPING, DAMPED * damping)
 
-    def _density(self, point: _Point, model: Weighed) -> float:
-        """Logarithm of the density at the unknowns of a point, up to a constant, with noise and widths of a model.
+    def _density(self, point: _Point, widths: Sequence[int]) -> float:
+        """Logarithm of the density at the unknowns of a point, up to a constant, where its noise begins.
 
         The evidence is what it would be at the end of the step from there, if that were linear.
         """
-        likelihood, noise = model.start.begun(point.rows)
-        return point.priors.posterior(likelihood.reduced(noise)[0], model.widths).held().evidence
+        ((likelihood, noise),) = point.starts
+        return point.priors.posterior(likelihood.reduced(noise)[0], widths).held().evidence
 
     def _nested(
         self, priors: Priors, tracks: Reduced, widths: Sequence[int], mixed: Sequence[float]

@@ -47,11 +47,12 @@ def test_a_step_gains_what_it_promises(make_ball, moved_shots, make_fit):
     """From a drag that is far off: what the linear model foretells of the density of all tracks comes true."""
     fit = make_fit(make_ball(), moved_shots)
     question = weighing._Question((), random_motion(fit), unlike_halves(fit), None)
-    point = question.point(followed(fit, at_drag(fit, 0.02)))
-    found, ahead, density = question.at(point, (None,))
+    point = question.point(followed(fit, at_drag(fit, 0.02)), (None,))
+    found, ahead, density = question.at(point)
     after, damping = question.moved(point, found, ahead, density)
-    assert density == pytest.approx(question._density(point, found), abs=0.5)
-    gained = question._density(after, found) - question._density(point, found)
+    before = question._density(point.begun_at((found.start,)), found.widths)
+    assert density == pytest.approx(before, abs=0.5)
+    gained = question._density(after, found.widths) - before
     assert ahead.gain > 10.0
     assert damping == 0.0
     assert gained == pytest.approx(ahead.gain, rel=0.4)
