@@ -6,6 +6,7 @@ only the inner products of projected signatures, summed over each track.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,11 +21,18 @@ class Eliminated:
 
     Attributes:
         solved: (n, 9, q + 1) first states that absorb each column, the residual last.
-        gram: (n, q + 1, q + 1) inner products of projected columns, the residual last.
+        left: (n, m, q + 1) what they leave of each column, turned.
     """
 
     solved: Array
-    gram: Array
+    left: Array
+
+    @cached_property
+    def gram(self) -> Array:
+        """(n, q + 1, q + 1) inner products of projected columns, the residual last."""
+        # about a path far off squares overflow: what it gives is not finite and loses
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(self.left.swapaxes(-1, -2) @ self.left)
 
     def common_step(self, precision: Array, pull: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
         """(q,) best step of the common unknowns within limits.
@@ -74,14 +82,11 @@ class System:
         n, m, end = *columns.shape[:2], STATE_DIM + columns.shape[-1]
         rows, upper = np.zeros((n, m, padded(end))), np.zeros((n, STATE_DIM, padded(end)))
         rows[..., :STATE_DIM], rows[..., STATE_DIM:end] = self.by_start, columns
-        squares = (self.by_start**2).sum(axis=1)
+        squares = np.einsum("nmi,nmi->ni", self.by_start, self.by_start)
         upper[:, diagonal, diagonal] = np.sqrt((squares == 0.0) + damping * np.where(squares == 0.0, 1.0, squares))
         eliminate_each(rows, upper)
-        left = rows[..., STATE_DIM:end]
         solved = np.linalg.solve(upper[..., :STATE_DIM], upper[..., STATE_DIM:end])
-        # about a path far off squares overflow: what it gives is not finite and loses
-        with np.errstate(over="ignore", invalid="ignore"):
-            return Eliminated(np.asarray(solved), np.asarray(left.swapaxes(-1, -2) @ left))
+        return Eliminated(np.asarray(solved), rows[..., STATE_DIM:end])
 
     def start_correction(self, residual: Array) -> Array:
         """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""

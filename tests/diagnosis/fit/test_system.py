@@ -161,3 +161,11 @@ def test_what_first_states_all_but_absorb_keeps_its_digits():
     column = absorbed + 3e-8 * left
     gram = System(other, by_start, column[..., None]).eliminated().gram
     np.testing.assert_allclose(gram[:, 0, 0], 9e-16 * (left**2).sum(axis=1), rtol=1e-6)
+
+
+def test_first_states_that_follow_a_common_step_are_those_of_least_squares(system):
+    step = np.arange(1.0, Q + P + 1.0)
+    left = system.residual - system.by_common @ step
+    dense = [np.linalg.lstsq(b, r, rcond=None)[0] for b, r in zip(system.by_start, left, strict=True)]
+    np.testing.assert_allclose(system.start_correction(left), dense, atol=1e-12)
+    np.testing.assert_allclose(system.eliminated().start_step(step), dense, atol=1e-12)
