@@ -140,7 +140,8 @@ class Likelihood:
         """(n, d, d) information with priors of the random columns, and (n,) logarithms of the sizes."""
         logs = np.array(noise.spin)[self.rows.spin_kinds]
         spins = self.spin_columns * np.exp(-logs)[..., None]
-        total = self.gram * np.exp(-2.0 * noise.white) + spins.swapaxes(1, 2) @ spins
+        total = self.gram * np.exp(-2.0 * noise.white)
+        total += spins.swapaxes(1, 2) @ spins  # in place: a new array of this size costs more than the sum
         kinds, first = self.rows.kinds, np.arange(STATE_DIM)
         sizes = np.append(noise.random, 0.0)[kinds]
         place = STATE_DIM + np.arange(kinds.shape[1])

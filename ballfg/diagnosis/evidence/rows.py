@@ -123,7 +123,9 @@ class Rows:
     @cached_property
     def gram(self) -> Array:
         """(b, d, d) inner products of the rows of samples; columns start, random, common, residual."""
-        return self.inner_products(np.ones(self.used.shape))
+        listed = (self.by_start, self.random, self.by_common, self.residual[..., None])
+        rows = np.concatenate([columns[:, :-3] for columns in listed], axis=-1)  # zero for samples that are not there
+        return rows.swapaxes(1, 2) @ rows
 
     def inner_products(self, weights: Array) -> Array:
         """(b, d, d) the same of weighted samples; weights: (b, k), not negative. It is fast where few are not zero."""
