@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from ballfg.interrupts import interrupted, let_go, listen, say_so
-from ballfg.machine import collect_rarely
+from ballfg.machine import collect_rarely, keep_memory
 
 
 def ballfg() -> None:
@@ -37,6 +37,7 @@ def _run(module: str) -> None:
         _open_streams()
         _check_folder()
         collect_rarely()
+        keep_memory()
         import_module(module).run()
     except KeyboardInterrupt:
         _leave(say_so())

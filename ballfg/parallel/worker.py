@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 from threading import Thread
 from typing import Any, Final
 
-from ballfg.machine import collect_rarely
+from ballfg.machine import collect_rarely, keep_memory
 from ballfg.parallel.work import compute, packed
 
 IDLE: Final = 300.0  # s without work after which a process ends
@@ -21,6 +21,7 @@ def serve(handle: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at the terminal: the calling process ends this one
     Thread(target=_end_with_asker, daemon=True).start()
     collect_rarely()
+    keep_memory()
     _asker = Connection(handle)
     try:
         while _asker.poll(IDLE):
