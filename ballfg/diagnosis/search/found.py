@@ -172,7 +172,8 @@ class Found(WeighedModels):
         loop.watch("weighing what has no name")
         nothing = self.models[frozenset()]  # a name has to beat that at its best
         about = {m.names: m for m in (nothing, self.best)}.values()
-        beside = [weighed(m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in about]
+        tasks = [partial(weighed, m.fit, m.named, self.motion, self.halves, m, self.patterns) for m in about]
+        beside = do_all(tasks, self.jobs)
         self.known(beside)
         scores = self.scores
         if NAMELESS not in max(scores, key=lambda names: scores[names]):
