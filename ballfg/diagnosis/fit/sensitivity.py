@@ -20,6 +20,7 @@ from ballfg.diagnosis.fit.tangents import Coefficients, MovedArc, RepeatedMotion
 from ballfg.dynamics import BallModel
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
 from ballfg.dynamics.model import substitute
+from ballfg.parallel.parts import in_parts
 from ballfg.state import SPIN, STATE_DIM
 
 MOST_ROWS = 3000
@@ -117,7 +118,8 @@ def sensitivity(
             positions[rows, :count], labels[rows] = found.positions, found.labels
         return Sensitivity(positions, labels)
     size = max(1, most_rows // len(stretches))
-    parts = [_derivatives(replace(asked, wanted=wanted[first : first + size])) for first in range(0, len(wanted), size)]
+    some = [replace(asked, wanted=wanted[first : first + size]) for first in range(0, len(wanted), size)]
+    parts = list(in_parts(_derivatives, some, 1))
     both = ([getattr(part, name) for part in parts] for name in ("positions", "labels"))
     return Sensitivity(*(np.concatenate(one, axis=-1) for one in both))
 

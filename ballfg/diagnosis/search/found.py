@@ -206,23 +206,20 @@ class Found(WeighedModels):
             now, waiting = waiting[:AT_ONCE], waiting[AT_ONCE:]
             for attempt in now:
                 tell(f"fitting with {attempt.words}")
-            made = do_all([task for attempt in now for task in attempt.refits], self.jobs)
-            refits += made
-            winner = self.most_probable(w for w in (winner, self._weighed(made)) if w is not None)
+            alike = (self.best, self.motion, self.halves)
+            tasks = [partial(_weighed_refit, task, *alike) for attempt in now for task in attempt.refits]
+            made = do_all(tasks, self.jobs)
+            refits += [refitted for refitted, _ in made]
+            likely = self._likely([model for _, model in made if model is not None])
+            winner = self.most_probable(w for w in (winner, likely) if w is not None)
         return sorted(refits, key=lambda r: r.delta_bic), winner
 
-    def _weighed(self, refits: Sequence[Refit]) -> Weighed | None:
+    def _likely(self, refits: Sequence[Weighed]) -> Weighed | None:
         """The most probable of some refits, and of them without an effect that they make superfluous; None without any.
 
         One that takes the place of a named effect needs both for a while.
         """
-        best = self.best
-        tasks = [
-            partial(weighed, r.fit, (*best.named, *r.added), self.motion, self.halves, best)
-            for r in refits
-            if np.isfinite(r.fit.cost)
-        ]
-        found = self.known(do_all(tasks, self.jobs))
+        best, found = self.best, self.known(refits)
         scores = self.scores
         for model in list(found):
             smaller = self._smaller(model)
@@ -260,6 +257,16 @@ class Found(WeighedModels):
             if least is None or not self.is_better(least):
                 return self.best is not whole
             self.best = least
+
+
+def _weighed_refit(
+    task: Callable[[], Refit], best: Weighed, motion: Motion, halves: Mask
+) -> tuple[Refit, Weighed | None]:
+    """A refit of a model with further effects, and how probable it is; None if it has no path."""
+    refitted = task()
+    if not np.isfinite(refitted.fit.cost):
+        return refitted, None
+    return refitted, weighed(refitted.fit, (*best.named, *refitted.added), motion, halves, best)
 
 
 def _in_place(
