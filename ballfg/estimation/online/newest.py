@@ -8,6 +8,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.final import unknown
+from ballfg.estimation.online.first_rest import FirstRest
 from ballfg.estimation.online.state import Measurement, OnlineState, Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.plausible import possible
@@ -45,11 +46,13 @@ class Newest:
         self.monitor = ContactMonitor(HypothesisModel(owner.ball, owner.surfaces, owner.settings, further))
         self.hit = HitDoubt(owner.settings, owner.events.settings)
         self.rest = RestDoubt(owner.events.settings)
+        self.first = FirstRest(self.monitor.model, owner.events.settings)
 
     def copy(self) -> "Newest":
         """The same, which further samples leave as it is."""
         other = copy.copy(self)
-        other.monitor, other.hit, other.rest = copy.copy(self.monitor), copy.copy(self.hit), copy.copy(self.rest)
+        other.monitor, other.hit = copy.copy(self.monitor), copy.copy(self.hit)
+        other.rest, other.first = copy.copy(self.rest), copy.copy(self.first)
         return other
 
     def after(
@@ -58,6 +61,7 @@ class Newest:
         """The state after a new sample, the last one. Args: before: the belief at the one before it, if it counts."""
         contact = self._near_contact(samples, before)
         state = self._state(window, samples[-1], contact, update)
+        state = self._in_doubt_of_rolling(state)
         state = self._in_doubt_of_rest(state, samples, before)
         return self._in_doubt_of_a_hit(state, samples, None if contact is not None else before)
 
@@ -68,6 +72,20 @@ class Newest:
             seen = SampleMeasurement(factors=[sighting.batch])
             contact = self.monitor.update(seen, lambda count: has_bounced(samples, count))
         return self._state(window, samples[-1], contact, update)
+
+    def rolls_at_first(self, samples: list[Sample], begin: int) -> bool:
+        """True if a ball without a spin label, on a surface with the first sample of a stream, more probably rolled.
+
+        Args: samples: of the window.  begin: number of its first one in the stream.
+        """
+        first = samples[0]
+        if not begin and (
+            first.label is not None or not first.measured or len(samples) < 2 or samples[1].motion.rest is None
+        ):
+            self.first.reset()
+        else:
+            self.first.follow(samples, begin)
+        return self.first.rolls
 
     def _near_contact(self, samples: list[Sample], before: tuple[Array, Array] | None) -> ContactState | None:
         """The state to report on either side of a contact, from the belief a sample before; None far from one."""
@@ -92,6 +110,13 @@ class Newest:
         dt, measured = sample.time - samples[-2].time, (sample.position, sample.stated, sample.whole)
         joint = self.hit.widened(self.monitor.model, before, dt, measured, (state.mean, state.joint))
         return state if joint is state.joint else replace(state, joint=joint, struck=joint - state.joint)
+
+    def _in_doubt_of_rolling(self, state: OnlineState) -> OnlineState:
+        """The state of a ball on the surface where it was first seen, widened as it may have slid, or rolled, there."""
+        if not possible(state.state):
+            return state
+        mean, joint = self.first.beside(state.mean, state.joint)
+        return state if joint is state.joint else replace(state, mean=mean, joint=joint)
 
     def _in_doubt_of_rest(
         self, state: OnlineState, samples: list[Sample], before: tuple[Array, Array] | None

@@ -337,6 +337,11 @@ class Online(Estimator):
             launch = Track(*path_of(self._samples), name="stream", part=True)
             self._samples[0].label = group_spin(self.settings.spins, launch, self.settings.group)
             innovation = window.start_anew(self._samples)
+        assert self._newest is not None
+        rolls = self._newest.rolls_at_first(self._samples, window.first)
+        if window.first == 0 and rolls != self._samples[0].rolls:
+            self._samples[0].rolls = rolls
+            innovation = window.start_anew(self._samples)
         if len(window) > 2 * self.lag:
             if self._leaving is not None:
                 self._leaving.take(window, self.events, len(window) - self.lag)

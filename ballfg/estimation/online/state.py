@@ -99,6 +99,7 @@ class Sample:
         velocity: (3,) m/s, rough; the stamp's error displaces the sample along it.
         factor: multiple of the whole error for a sample that is not good; 1 for a good one.
         motion: how the ball got here from the sample before.  label: prior of the spin, on the first sample of a track.
+        rolls: True on a first sample without a label that shows a ball on a surface, if it more probably rolled there.
         slots: places in iSAM2 of the sample's own factors: its position's first, if it was measured.
         bias_slot: place of the factor from the previous sample's bias to this one's; None without.
         measured: True if the position was measured; else it was computed from the measurements to find events.
@@ -111,6 +112,7 @@ class Sample:
     factor: float = 1.0
     motion: Motion = FLIGHT
     label: SpinLabel | None = None
+    rolls: bool = False
     slots: tuple[int, ...] = ()
     bias_slot: int | None = None
     whole: Array = field(default_factory=lambda: np.zeros(3))

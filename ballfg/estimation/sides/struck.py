@@ -130,7 +130,7 @@ class RestDoubt:
         if over or self.left is None or self.left.log_weight <= 0.0:  # it did not look so
             self.reset()
             return None
-        left = self._weighed(model, model.predict_flight(self.left, dt), measured).merged()
+        left = weighed(model, model.predict_flight(self.left, dt), measured, self.priors).merged()
         self.left = replace(left, log_weights=np.ones(1))
         return self.left.means[0], self.left.covariances[0]
 
@@ -160,26 +160,31 @@ class RestDoubt:
         parts = [replace(leaves, log_weights=np.log([max(chance, TINY)]))]
         if self.left is not None:
             parts.append(model.predict_flight(self.left, dt))
-        left = self._weighed(model, GaussianMixture.concatenated(parts), measured).merged()
-        kept = self._weighed(model, replace(stays, log_weights=np.log([max(1.0 - chance, TINY)])), measured)
+        left = weighed(model, GaussianMixture.concatenated(parts), measured, self.priors).merged()
+        resting = replace(stays, log_weights=np.log([max(1.0 - chance, TINY)]))
+        kept = weighed(model, resting, measured, self.priors)
         self.left = left.divided(kept.log_weight)
         share = float(np.exp(left.log_weight - np.logaddexp(left.log_weight, kept.log_weight)))
         return (share, left.means[0], left.covariances[0]) if share > LEAST_CHANCE else None
 
-    def _weighed(
-        self, model: HypothesisModel, balls: GaussianMixture, measured: tuple[Array, Array]
-    ) -> GaussianMixture:
-        """Balls after a measured position, which may be an outlier."""
-        off, noise, H = model.innovations(balls, *measured)
-        good, _ = balls.updated(off, noise, H)
-        wide = self.priors.outlier_spread**2 * np.eye(3)
-        lost = [
-            log_density(one, H @ spread @ H.T + own + wide)
-            for one, spread, own in zip(off, balls.covariances, noise, strict=True)
-        ]
-        outliers = replace(balls, log_weights=balls.log_weights + lost)
-        share = self.priors.outlier_share
-        return GaussianMixture.concatenated([good.divided(-math.log1p(-share)), outliers.divided(-math.log(share))])
+
+def weighed(
+    model: HypothesisModel, balls: GaussianMixture, measured: tuple[Array, Array], priors: SegmentationSettings
+) -> GaussianMixture:
+    """Balls after a measured position, which may be an outlier.
+
+    Args: measured: (3,) m, position and standard deviation of its white error.  priors: of outliers.
+    """
+    off, noise, H = model.innovations(balls, *measured)
+    good, _ = balls.updated(off, noise, H)
+    wide = priors.outlier_spread**2 * np.eye(3)
+    lost = [
+        log_density(one, H @ spread @ H.T + own + wide)
+        for one, spread, own in zip(off, balls.covariances, noise, strict=True)
+    ]
+    outliers = replace(balls, log_weights=balls.log_weights + lost)
+    share = priors.outlier_share
+    return GaussianMixture.concatenated([good.divided(-math.log1p(-share)), outliers.divided(-math.log(share))])
 
 
 def beside(near: tuple[Array, Array], far: tuple[Array, Array], chance: float) -> Array:

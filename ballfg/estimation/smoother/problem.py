@@ -243,6 +243,25 @@ def start_priors(state: int, position: Array, label: SpinLabel | None, settings:
     return [_wide_prior(state, position, settings), about]
 
 
+def rolling_priors(state: int, position: Array, radius: float, settings: Settings) -> list[FactorBatch]:
+    """Priors on a state without a link to a previous one of a ball of a radius (m) that rolls on a level surface."""
+    root = rolling_axes(radius)[SPIN] / rolling_spread(settings)[:, None]
+    rolls = prior.PriorFactors(np.array([state]), np.zeros((1, STATE_DIM)), root[None])
+    return [_wide_prior(state, position, settings), rolls]
+
+
+def rolling_axes(radius: float) -> Array:
+    """(9, 9) from a state to one with the spin less that of rolling without slip, of a ball of a radius (m)."""
+    axes: Array = np.eye(STATE_DIM)
+    axes[SPIN.start, VELOCITY.start + 1], axes[SPIN.start + 1, VELOCITY.start] = 1.0 / radius, -1.0 / radius
+    return axes
+
+
+def rolling_spread(settings: Settings) -> Array:
+    """(3,) rad/s, standard deviations of the spin of a rolling ball about that without slip; any about the vertical."""
+    return np.array([settings.process.contact_spin, settings.process.contact_spin, settings.spin_prior])
+
+
 def _wide_prior(state: int, position: Array, settings: Settings) -> prior.PriorFactors:
     mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
     mean[POSITION] = position

@@ -20,7 +20,7 @@ from ballfg.estimation.online.state import Measurement, Sample, prepare
 from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.windows.window_filter import WindowFilter
 from ballfg.estimation.settings import Settings, stamp_covariance
-from ballfg.estimation.smoother.problem import coefficient_means, start_priors
+from ballfg.estimation.smoother.problem import coefficient_means, rolling_priors, start_priors
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.correlated_noise import BIAS_DIM, BiasedPositionFactors
 from ballfg.factors.dynamics import model_width
@@ -238,7 +238,10 @@ class StreamWindow(ABC):
         state[POSITION] = sample.position
         if sample.label is not None:
             state[SPIN] = sample.label.spin
-        priors = start_priors(0, sample.position, sample.label, self.settings)
+        if sample.rolls:
+            priors = rolling_priors(0, sample.position, self.model.radius, self.settings)
+        else:
+            priors = start_priors(0, sample.position, sample.label, self.settings)
         self._relinearize(None)
         self._insert([Arrival(sample, state, None, priors)])
         return np.full(3, np.nan)
