@@ -195,11 +195,11 @@ def beside(near: tuple[Array, Array], far: tuple[Array, Array], chance: float) -
 
 def _share_kept(earlier: GaussianMixture, later: GaussianMixture, world: Array) -> float:
     """Share of balls on the table that have not passed its ends from one moment to the next."""
-    before, after = (_share_within(balls.means[0], balls.covariances[0], world) for balls in (earlier, later))
+    before, after = (share_within(balls.means[0], balls.covariances[0], world) for balls in (earlier, later))
     return min(after / before, 1.0) if before > TINY else 0.0
 
 
-def _share_within(mean: Array, covariance: Array, world: Array) -> float:
+def share_within(mean: Array, covariance: Array, world: Array) -> float:
     """Share of balls (d,), (d, d) whose centres lie within the table's ends."""
     share = 1.0
     for axis in range(2):

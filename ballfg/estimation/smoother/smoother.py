@@ -27,6 +27,7 @@ from ballfg.estimation.smoother.second_look.at_end import (
     from_before_a_bounce,
     log_evidence,
     with_both_sides,
+    with_fall_at_end,
     with_hit_at_end,
     with_other_beginning,
 )
@@ -273,6 +274,7 @@ class Smoother(Estimator):
         if problem.one_view:  # the first samples alone, as a second look takes them, would not show their depth
             return problem.judged(estimate)
         estimate = with_hit_at_end(self, problem, with_both_sides(self, problem, estimate))
+        estimate = with_fall_at_end(self, problem, estimate)
         segmentation = solution.events.segmentation
         hops = problem.hops if segmentation is problem.segmentation else None
         hops = self.low_hops(problem.track, segmentation) if hops is None else hops

@@ -10,15 +10,24 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import bounced, gap_jacobian
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.segmentation.result import Contact, Quality
+from ballfg.estimation.segmentation.result import Contact, Quality, Rest
 from ballfg.estimation.segmentation.segmenter import USUAL
+from ballfg.estimation.sides.gaussians import GaussianMixture
 from ballfg.estimation.sides.hypotheses import HypothesisModel, measured_at
-from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, widening, with_contact_states
+from ballfg.estimation.sides.monitor import (
+    LEAST_SAMPLES,
+    LEAST_TIME,
+    ContactMonitor,
+    ContactState,
+    widening,
+    with_contact_states,
+)
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, TrackProblem
 from ballfg.estimation.smoother.settle import LEAST_FALL, Earlier, Solution
 from ballfg.factors.batch import Values
@@ -88,6 +97,75 @@ def with_hit_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Estim
     for k, joint in found.items():
         covariances[k], cross[k] = joint[:STATE_DIM, :STATE_DIM], joint[:STATE_DIM, STATE_DIM:]
     return replace(estimate, covariances=covariances, cross_covariances=cross)
+
+
+def with_fall_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
+    """The estimate; where it ends while a ball rolls over an end of the table, its last state holds that it may fall.
+
+    A fall shows late: 2 mm in 20 ms. So a ball that rolls and one that has left are followed from where it certainly
+    was on the table (`ballfg.estimation.sides.struck`).
+    """
+    rests = problem.segmentation.rests
+    if estimate.status.failed or problem.track.rough or not rests or smoother.surfaces.extent is None:
+        return estimate
+    begin = _before_an_end(smoother, problem, estimate, rests[-1])
+    if begin is None:
+        return estimate
+    found = _fallen(smoother, problem, begin, rests[-1].height, estimate.quality)
+    if found is None:
+        return estimate
+    state = ContactState(*found, np.zeros((STATE_DIM, STATE_DIM)), bounced=False)
+    return with_contact_states(estimate, {len(estimate) - 1: state})
+
+
+def _before_an_end(smoother: "Smoother", problem: TrackProblem, estimate: Estimate, rest: Rest) -> int | None:
+    """The last sample of a rest at which the ball is certainly on the table; None if it is there to the end.
+
+    None too where the ball left the rest so long ago that the segmentation knows of it.
+    """
+    from ballfg.estimation.sides.struck import LEAST_CHANCE, share_within
+
+    n, times, left = len(estimate), problem.track.times, min(rest.last + 1, len(estimate) - 1)
+    if n - 1 - left > LEAST_SAMPLES and times[-1] - times[left] > LEAST_TIME:
+        return None
+    world = HypothesisModel(problem.ball, smoother.surfaces, problem.settings).world
+    if share_within(estimate.states[-1], estimate.covariances[-1], world) > 1.0 - LEAST_CHANCE:
+        return None
+    for k in range(left, rest.first, -1):
+        if share_within(estimate.states[k], estimate.covariances[k], world) > 1.0 - CERTAIN:
+            met = [*estimate.hits.tolist(), *(contact.interval for contact in estimate.contacts)]
+            return None if any(interval >= k for interval in met) else k
+    return None
+
+
+def _fallen(
+    smoother: "Smoother", problem: TrackProblem, begin: int, level: float, quality: NDArray[np.int8]
+) -> tuple[Array, Array] | None:
+    """Mean and covariance of the last state and coefficients of a ball that rolls or falls; None if it hardly falls.
+
+    Args: begin: a sample where the ball rolls.  level: m, of the surface.  quality: (n,) of the samples.
+    """
+    from ballfg.estimation.sides.struck import RestDoubt, beside, weighed
+
+    track, d, found = problem.track, STATE_DIM + problem.width, None
+    rolling = _filtered(smoother, track.between(track.times[max(begin + 1 - MEMORY, 0)], track.times[begin]))
+    if rolling is None:
+        return None
+    model = HypothesisModel(problem.ball, smoother.surfaces, problem.settings, len(rolling[0]) - d)
+    doubt = RestDoubt(USUAL)
+    for k in range(begin + 1, len(track)):
+        sigma = problem.sigma[k] / QUALITY_SIGMA.get(Quality(quality[k]), 1.0)
+        dt, measured = float(track.times[k] - track.times[k - 1]), (track.positions[k], sigma)
+        found = doubt.step(model, rolling, dt, measured, level)
+        rolled = model.predict_rest(GaussianMixture.single(*rolling), dt, level)
+        rolled = weighed(model, rolled, measured, USUAL).merged()
+        rolling = rolled.means[0], rolled.covariances[0]
+    if found is None:
+        return None
+    chance, near, far = found[0], rolling, found[1:]
+    if chance > 0.5:
+        near, far, chance = far, near, 1.0 - chance
+    return near[0][:d], beside(near, far, chance)[:d, :d]
 
 
 def _at_end(
