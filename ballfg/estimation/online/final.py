@@ -1,5 +1,6 @@
 """Computes the final estimate of a streamed track: the window's minimum and the states that left the window."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,6 +17,8 @@ from ballfg.estimation.smoother.settle import Earlier
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
+
+_NUMBER = re.compile(r"[0-9]+([.][0-9]+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +57,19 @@ class Leaving:
         self.parts.append(part)
 
     def whole(self, window: StreamWindow, events: EventTracker) -> Estimate:
-        """The result over the whole track, from the window at its end and the states before it."""
+        """The result over the whole track, from the window at its end and the states before it.
+
+        Of notes that differ in their numbers only, the earliest window's stays.
+        """
         late = self._minimum(window, events)
         if not self.parts:
             return late
         parts = [*self.parts, late]
-        return joined(late, self.track.times, parts, lambda known, own: own if known is Status.OK else known)
+        whole = joined(late, self.track.times, parts, lambda known, own: own if known is Status.OK else known)
+        said = {
+            _NUMBER.sub("", note): note for part in reversed(parts) for note in part.notes
+        }  # the earliest of a kind
+        return replace(whole, notes=tuple(reversed(said.values())))
 
     def _minimum(self, window: StreamWindow, events: EventTracker) -> Estimate:
         """The estimate of the window's samples, with all that is known from those before it."""

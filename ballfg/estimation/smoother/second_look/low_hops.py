@@ -191,10 +191,13 @@ def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
 
 
 def uncounted_note(hops: Sequence[LowHops], times: Array) -> tuple[str, ...]:
-    """A note on when bounces become too low to count. Args: hops: of the track.  times: (n,) s."""
+    """A note on when bounces become too low to count.
+
+    Args: hops: of the track or a part of it.  times: (n,) s, of the same samples since the first one of the track.
+    """
     lower = ((one.first, (one.known.speed < one.least) & (one.known.resting < SURE)) for one in hops)
     unclear = [first + int(np.argmax(low)) for first, low in lower if low.any()]
-    return (UNCOUNTED.format(float(times[min(unclear)] - times[0])),) if unclear else ()
+    return (UNCOUNTED.format(float(times[min(unclear)])),) if unclear else ()
 
 
 class _Ball:
