@@ -156,7 +156,8 @@ class Online(Estimator):
             other.window = self.window.copy(other._samples[: len(self.window)])
         other.events = self.events.copy()
         other._newest = None if self._newest is None else self._newest.copy()
-        other._stream, other.scatter = copy.deepcopy((self._stream, self.scatter))
+        other._stream = copy.deepcopy(self._stream)
+        other.scatter = None if self.scatter is None else self.scatter.copy()
         other._origin = copy.copy(self._origin)
         return other
 

@@ -1,6 +1,7 @@
 """The white noise that a stream shows, where nobody states one."""
 
-from typing import Final
+import copy
+from typing import Final, Self
 
 import numpy as np
 
@@ -25,6 +26,12 @@ class StreamScatter:
         self.sigma = sigma
         self._times: list[float] = []
         self._positions: list[Array] = []
+
+    def copy(self) -> Self:
+        """An independent one; `sigma` stays the same array, by which samples that have it are known."""
+        other = copy.copy(self)
+        other._times, other._positions = self._times.copy(), self._positions.copy()
+        return other
 
     @property
     def known(self) -> bool:

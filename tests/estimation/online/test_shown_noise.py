@@ -93,6 +93,20 @@ def test_stated_noise_stays_and_a_copy_learns_by_itself() -> None:
         bf.Online(bf.nominal_model(), 0.0, shown_noise="yes")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("copied", [3, 7, 12])
+def test_a_copy_has_the_states_of_a_stream_that_was_never_copied(copied: int) -> None:
+    """Also where a noise that shows later changes samples from before the copy."""
+    rng = np.random.default_rng(13)
+    times, positions, _ = flown(30, rng)
+    measured = positions + rng.normal(0.0, 0.01, positions.shape)
+    online, other = (bf.Online(bf.nominal_model(), 0.0) for _ in range(2))
+    for k, (t, p) in enumerate(zip(times, measured, strict=True)):
+        other = other.copy() if k == copied else other
+        np.testing.assert_array_equal(online.push(t, p).covariance, other.push(t, p).covariance)
+    assert online.scatter is not None
+    assert (online.scatter.sigma > 0.004).all()
+
+
 def test_a_refused_sample_shows_no_noise() -> None:
     times, positions, _ = flown(20, np.random.default_rng(8))
     measured = positions + np.random.default_rng(9).normal(0.0, 0.004, positions.shape)
