@@ -69,7 +69,7 @@ def estimate(
     """Position, velocity and spin of the ball at every stamp, with covariances.
 
     By default, ball, table and noise are those of a track's dataset. A track without a dataset counts as a table-tennis
-    ball above a table at z = 0, and the scatter of its samples about smooth paths as their noise; the notes of its
+    ball above a table at z = 0, and the scatter of its flights about smooth paths as their noise; the notes of its
     estimate list signs against that.
 
     Args:
@@ -356,13 +356,20 @@ def estimator_for(
 
 
 def _shown_settings(track: Track, ball: BallModel) -> Settings:
-    """The settings of a track without a dataset: its own scatter gives the noise of its positions."""
+    """The settings of a track without a dataset: the scatter of its flights gives the noise of its positions."""
+    from ballfg.estimation.flights.labels import label_samples
     from ballfg.estimation.measurement.position_noise import estimate_position_noise
+    from ballfg.estimation.result import Label
+    from ballfg.estimation.segmentation.physics import physics_of
 
     settings = Settings.for_measured(ball)
     if track.sigmas is not None or track.rough or ball.states_position_noise:
         return settings
-    x, y, z = estimate_position_noise([track]).tolist()
+    labels = label_samples(track, physics_of(ball))
+    flying = labels.values == Label.FLIGHT  # not at rest, where the noise may be another one, nor outliers
+    runs = (first + np.flatnonzero(flying[first : last + 1]) for first, last in labels.stretches(Label.FLIGHT))
+    flights = [Track(track.times[run], track.positions[run]) for run in runs]
+    x, y, z = estimate_position_noise(flights or [track]).tolist()
     return replace(settings, position_noise=(x, y, z))
 
 

@@ -11,6 +11,7 @@ import ballfg as bf
 from ballfg.dynamics import save_model
 from ballfg.estimation import dataset_settings
 from ballfg.estimation.track_prediction import TrackPrediction
+from ballfg.front import estimator_for
 from ballfg.simulation import MeasurementNoise, SimulationConfig, tennis, write_simulation
 from tests.front.my_shots import same, written
 from tests.interpreter import fresh
@@ -65,6 +66,37 @@ def test_arrays_have_the_noise_that_they_show(noise: float, tmp_path: Path) -> N
         narrower.append(sigmas / np.sqrt(np.diag(usual.covariance)[3:6]))
     assert np.mean(held) > 0.8
     assert (np.median(narrower) < 0.8) == (noise < 0.0015)
+
+
+def thrown(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (60,) s and positions (60, 3) m of a ball in a vacuum, with a noise of 3 mm."""
+    times = np.arange(60) / 100.0
+    path = np.array([0.0, 0.0, 0.4]) + np.outer(times, [4.0, 0.3, 3.0]) - np.outer(times**2, [0.0, 0.0, 4.905])
+    return times, path + rng.normal(0.0, 0.003, path.shape)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.0003])
+def test_arrays_have_the_noise_of_their_flights_not_that_of_rest(noise: float) -> None:
+    """A ball that lies for longer than it flies; the last velocity in closed form."""
+    rng, squares = np.random.default_rng(20), []
+    for _ in range(4):
+        times, flight = thrown(rng)
+        still = [0.0, 0.0, 0.4] + rng.normal(0.0, 1.0, (150, 3)) * noise
+        last = bf.estimate((np.arange(210) / 100.0, np.vstack((still, flight)))).last
+        off = last.state[3:6] - [4.0, 0.3, 3.0 - 9.81 * times[-1]]
+        squares.append(off @ np.linalg.solve(last.covariance[3:6, 3:6], off))
+        assert np.sqrt(np.diag(last.covariance)[:3]) == pytest.approx([0.0017] * 3, rel=0.5)
+    assert np.median(squares) < 6.0
+
+
+def test_outliers_are_no_noise_of_arrays() -> None:
+    """Of windows of 11 samples, of which a fifth are outliers, hardly one is without."""
+    rng, found = np.random.default_rng(21), []
+    for _ in range(9):
+        times, positions = thrown(rng)
+        positions[rng.choice(60, 12, replace=False)] += rng.normal(0.0, 0.2, (12, 3))
+        found.append(estimator_for(bf.Track(times, positions)).settings.position_noise)
+    assert np.median(found, axis=0) == pytest.approx([0.003] * 3, rel=0.3)
 
 
 def test_a_model_file_takes_the_place_of_the_nominal_model(track: bf.Track, tmp_path: Path) -> None:
