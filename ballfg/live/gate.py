@@ -53,8 +53,12 @@ class Gate:
     def __init__(self, physics: SegmentationPhysics, heights: Sequence[float], noise: Array, jitter: float) -> None:
         self.physics = physics
         self.rises = sorted((h + physics.radius for h in heights), reverse=True)
-        self.noise = np.maximum(noise, FLOOR) ** 2
+        self.noise = self.least = np.maximum(noise, FLOOR) ** 2
         self.jitter = jitter
+
+    def set_noise(self, noises: Sequence[Array]) -> None:
+        """The noise of a position is the largest of some (3,) m, and of that which it began with."""
+        self.noise = np.max([self.least, *np.square(noises)], axis=0)
 
     def on_path(self, ball: Known, time: float, positions: Array) -> Array:
         """(n,) squared Mahalanobis distances of positions (n, 3) m from a ball that flew on or bounced.

@@ -120,8 +120,8 @@ class Tracker:
         gap: s, after which an unseen ball is dropped.
         confirm: number of consistent samples that make a ball.
         most: largest number of balls at once; positions of further ones are refused.
-        shown_noise: True: positions without sigmas have the noise that the first balls show, not the settings'. None:
-            if neither settings nor the model's file state it.
+        shown_noise: True: positions without sigmas have the noise that their balls show, not the settings'; a ball
+            begins with that of earlier ones. None: if neither settings nor the model's file state it.
 
     Attributes:
         counts: of the input and its results.
@@ -342,6 +342,7 @@ class Tracker:
 
     def _taken(self, ball: Ball, frame: _Frame, k: int, kept: Kept) -> BallUpdate:
         reason, displaced = "", ball.at(kept.time)
+        told = ball.scatter is None or ball.scatter.known
         try:
             state = ball.take(kept)
         except (ValueError, RuntimeError) as error:
@@ -355,19 +356,22 @@ class Tracker:
         if displaced is not None:
             self._newcomers.append(Newcomer(displaced, self.gate))
         if self.estimator.shown_noise and ball.scatter is not None:
-            self._learn(ball.scatter)
+            self._learn(ball.scatter, told)
         return BallUpdate(
             "state", frame.time, ball.number, kept.position, state, ball.samples, ball.news(), frame.late, reason
         )
 
-    def _learn(self, scatter: StreamScatter) -> None:
-        """Widens the gate to the noise that a ball shows; once it is known, later balls begin with it."""
-        self.gate.noise = np.maximum(self.gate.noise, scatter.sigma**2)
-        if scatter.known:
+    def _learn(self, scatter: StreamScatter, told: bool) -> None:
+        """Sets the gate to the noise that the balls show; later balls begin with one that is known, told only once."""
+        if scatter.known and not told:
             usual = self.estimator
-            x, y, z = scatter.sigma.tolist()
-            own = replace(usual.settings, position_noise=(x, y, z), position_scale=1.0)
-            self.estimator = Online(usual.model, usual.surfaces, own)
+            x, y, z = (scatter.found / usual.settings.position_scale).tolist()
+            own = replace(usual.settings, position_noise=(x, y, z))
+            self.estimator = Online(usual.model, usual.surfaces, own, shown_noise=True)
+            self.estimator.scatter = StreamScatter(scatter.found, trusted=True)
+        assert self.estimator.scatter is not None
+        followed = [ball.scatter.sigma for ball in self._balls if ball.scatter is not None]
+        self.gate.set_noise([self.estimator.scatter.sigma, *followed])
 
     def _to_newcomers(self, frame: _Frame) -> None:
         rows, t = frame.open, frame.time

@@ -107,6 +107,24 @@ def test_a_copy_has_the_states_of_a_stream_that_was_never_copied(copied: int) ->
     assert (online.scatter.sigma > 0.004).all()
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.0003])
+def test_a_ball_that_lies_before_it_flies_is_known_as_well_as_stated(noise: float) -> None:
+    """At rest a tracker repeats positions or averages them; in flight they have 3 mm."""
+    rng, squares = np.random.default_rng(14), []
+    for _ in range(3):
+        times, positions, velocities = flown(40, rng)
+        still = positions[0] + rng.normal(0.0, 1.0, (150, 3)) * noise
+        online = bf.Online(bf.nominal_model(), 0.0)
+        for k, p in enumerate(still):
+            online.push(k / RATE, p)
+        states = [online.push(1.5 + t, p + rng.normal(0.0, 0.003, 3)) for t, p in zip(times, positions, strict=True)]
+        for state, velocity in zip(states[10:], velocities[10:], strict=True):
+            off = state.state[3:6] - velocity
+            squares.append(off @ np.linalg.solve(state.covariance[3:6, 3:6], off))
+        assert np.median([state.covariance[3:6, 3:6].trace() for state in states[10:]]) < 3 * 0.08**2
+    assert np.median(squares) < 6.0
+
+
 def test_a_refused_sample_shows_no_noise() -> None:
     times, positions, _ = flown(20, np.random.default_rng(8))
     measured = positions + np.random.default_rng(9).normal(0.0, 0.004, positions.shape)
@@ -149,3 +167,22 @@ def test_later_balls_begin_with_the_noise_that_the_first_one_showed() -> None:
     assert last[0] is not None
     assert same[0] is not None
     np.testing.assert_allclose(last[0].covariance, same[0].covariance, rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize("noises", [(0.0, 0.003), (0.02, 0.001)])
+def test_a_later_ball_of_another_noise_is_known_as_well_as_stated(noises: tuple[float, float]) -> None:
+    """A simulated ball first, or one that is far away: neither its noise nor its gate stays with the tracker."""
+    rng, tracker = np.random.default_rng(15), Tracker(bf.nominal_model(), -20.0)
+    for ball, noise in enumerate(noises):
+        squares, traces = [], []
+        times, positions, velocities = flown(LOOKED[-1] + 20, rng)
+        for k, (t, p) in enumerate(zip(times, positions, strict=True)):
+            (update,) = tracker.push(3.0 * ball + t, p + rng.normal(0.0, noise, 3))[-1:]
+            if k >= 30 and update.state is not None:
+                off, spread = update.state.state[3:6] - velocities[k], update.state.covariance[3:6, 3:6]
+                squares.append(off @ np.linalg.solve(spread, off))
+                traces.append(np.trace(spread))
+    assert len(squares) > 90
+    assert 0.3 < np.median(squares) < 6.0
+    assert np.median(traces) < 3 * 0.06**2
+    assert (np.sqrt(tracker.gate.noise) < 0.0045).all()
