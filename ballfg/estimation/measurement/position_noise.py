@@ -25,6 +25,8 @@ FACTOR_FOUR = 1.4  # Standard deviation of a logarithm when only the order of ma
 MAD_VARIANCE = 1.35
 """Variance of the logarithm of a robust sigma, times its number of windows: of cubics with white noise, 7 to 80 samples
 at 30 to 200 Hz."""
+COARSEST = 0.02  # m. Coordinates with a larger step in common are few places of a ball, not rounded ones
+INTEGER = 1e-3  # Of a step: values in single precision are multiples of it within this
 MOST_WINDOWS = 0.75  # Share of windows that dropped frames may not make too long; else windows have fewer samples
 LEAST_LEFT = 1e-6
 """Least share of a sample's variance that a fit leaves: a sample far from all others determines the cubic alone."""
@@ -48,11 +50,12 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     the flight.
 
     Args: tracks: read until there are enough windows.
-    Returns: (3,) m, at least `FLOOR`; `FALLBACK` if no track has 7 samples within 0.25 s, or if one bounce may be in
-        all windows of a single track and makes their residuals larger than that.
+    Returns: (3,) m, at least `FLOOR` and that of rounded coordinates; `FALLBACK` if no track has 7 samples within
+        0.25 s, or if one bounce may be in all windows of a single track and makes their residuals larger than that.
     """
-    blocks, count, size = list[Array](), 0, 0
+    blocks, count, size, rounding = list[Array](), 0, 0, np.zeros(3)
     for track in tracks:
+        rounding = np.maximum(rounding, _rounding(track.positions))
         blocks.append(_window_residuals(track.seconds, track.positions, np.ones_like(track.positions)))
         count, size = count + len(blocks[-1]), 2 * _half_window(track.seconds) + 1
         if count >= ENOUGH:
@@ -62,7 +65,25 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     alone = len(blocks) == 1  # one bounce may be in most windows, or in all
     if count == 0 or (alone and count <= size and _clean(residuals[:, 1], usual).mean() <= LEAST_CLEAN):
         return usual
-    return np.maximum(_expected(*_robust_sigma(residuals, usual if alone else None)), FLOOR)
+    least = np.maximum(rounding, FLOOR)  # cubics follow the rounded places of a slow ball
+    return np.maximum(_expected(*_robust_sigma(residuals, usual if alone else None)), least)
+
+
+def _rounding(positions: Array) -> Array:
+    """(3,) m, standard deviation of the rounding of coordinates (n, 3), where it lasts for some samples.
+
+    It is 0 unless all are multiples of one step, with at most half as many values as samples.
+    """
+    found = np.zeros(3)
+    for axis, coordinates in enumerate(positions.T):
+        values = np.unique(coordinates)
+        apart = np.diff(values)
+        step = apart.min(initial=COARSEST)
+        multiples = apart / step
+        lasts = step < COARSEST and 2 * len(values) <= len(coordinates)
+        if lasts and (np.abs(multiples - np.rint(multiples)) < INTEGER).all():
+            found[axis] = step / np.sqrt(12.0)
+    return found
 
 
 def _expected(sigma: Array, count: int) -> Array:

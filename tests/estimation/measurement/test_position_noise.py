@@ -176,6 +176,29 @@ def test_reading_stops_when_there_is_enough():
     assert estimate_position_noise(endless()) == pytest.approx(SIGMA, rel=0.06)
 
 
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("step", [0.002, 0.01])
+def test_rounded_positions_of_a_slow_axis_have_the_noise_of_the_rounding(step, single):
+    """Rounded places of a ball that moves by one step in several windows lie on their cubics; (3,) are their errors."""
+    times = np.arange(300) / 500.0
+    path = np.outer(times, [2.9, 20.3 * step, -1.0]) - np.outer(times**2, [0.0, 0.0, 4.905])
+    noisy = path + np.random.default_rng(15).normal(0.0, 1.0, path.shape) * [0.5 * step, 0.0, 0.0]
+    rounded = np.round(noisy / step) * step
+    found = estimate_position_noise([Track(times, rounded.astype(np.float32).astype(float) if single else rounded)])
+    errors = np.sqrt(np.square(rounded - path).mean(axis=0))
+    assert (found > 0.9 * errors).all()
+    assert (found < 2.0 * errors).all()
+
+
+def test_few_or_unrounded_places_are_no_rounding():
+    """Samples far apart of rounded places, or a ball that stood in two: their steps are no noise."""
+    times = np.arange(8) / 100.0
+    path = np.outer(times, [3.0, 0.5, 2.0]) + np.random.default_rng(14).normal(0.0, 0.0005, (8, 3))
+    assert (estimate_position_noise([Track(times, np.round(path, 3))]) < 0.002).all()
+    stood = np.repeat([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 40, axis=0)
+    assert np.array_equal(estimate_position_noise([Track(np.arange(80) / 100.0, stood)]), np.full(3, FLOOR))
+
+
 def test_no_noise_gives_the_floor():
     assert np.array_equal(estimate_position_noise([bouncing(np.random.default_rng(0), sigma=0.0)]), np.full(3, FLOOR))
 
