@@ -60,9 +60,11 @@ def test_a_stream_whose_noise_showed_is_that_of_the_noise_from_its_first_sample_
     times, positions, _ = flown(30, rng)
     measured = positions + rng.normal(0.0, 0.004, positions.shape)
     online = bf.Online(bf.nominal_model(), 0.0)
-    for t, p in zip(times, measured, strict=True):
+    assert online.scatter is not None
+    for k, (t, p) in enumerate(zip(times, measured, strict=True)):
+        before = online.scatter.sigma
         state = online.push(t, p)
-        assert online.scatter is not None
+        assert online.scatter.sigma is before or state.revised == k
         if len(online.window or ()) in LOOKED:
             same = bf.Online(bf.nominal_model(), 0.0, settings(1.0))
             for other_t, other_p in zip(times, measured, strict=True):
