@@ -351,18 +351,19 @@ def estimator_for(
     if settings is None and source is not None:
         settings = fitted_settings(source, ball, observed)
     elif settings is None:
-        settings = _shown_settings(cast(Track, data), ball)
+        settings = Settings.for_measured(ball)
+        make_estimator(method, ball, surfaces, settings).prepared(cast(Track, data))  # refuses what is no track
+        settings = _with_shown_noise(settings, cast(Track, data), ball)
     return make_estimator(method, ball, surfaces, settings)
 
 
-def _shown_settings(track: Track, ball: BallModel) -> Settings:
-    """The settings of a track without a dataset: the scatter of its flights gives the noise of its positions."""
+def _with_shown_noise(settings: Settings, track: Track, ball: BallModel) -> Settings:
+    """Settings for a track without a dataset: the scatter of its flights gives the noise of its positions."""
     from ballfg.estimation.flights.labels import label_samples
     from ballfg.estimation.measurement.position_noise import estimate_position_noise
     from ballfg.estimation.result import Label
     from ballfg.estimation.segmentation.physics import physics_of
 
-    settings = Settings.for_measured(ball)
     if track.sigmas is not None or track.rough or ball.states_position_noise:
         return settings
     labels = label_samples(track, physics_of(ball))
