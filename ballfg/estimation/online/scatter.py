@@ -15,8 +15,7 @@ LOOKED: Final = (7, 10, 14, 20, 28, 40, 56, 80, 112)
 CHANGED: Final = 1.5
 """Ratio of noises from which the stream is explained anew with the later one."""
 STILL: Final = 0.5  # m/s. A slower ball may be held or lie, where its noise may be another one than in flight
-SURE: Final = 3.0
-"""Standard deviations of what few samples show, by which a ball's noise differs from that of the balls before it."""
+SURE: Final = 3.0  # Standard deviations of what few samples show, by which it differs from the noise that counts
 
 
 class StreamScatter:
@@ -69,8 +68,8 @@ class StreamScatter:
         times, positions = map(np.array, zip(*self._samples, strict=True))
         found = estimate_position_noise([Track(times, positions, part=True)])
         windows = len(times) - 2 * LEAST_HALF_WINDOW
-        unsure = SURE * np.sqrt(MAD_VARIANCE / windows) if self._trusted else 0.0
-        differs = bool(np.abs(np.log(found / self.sigma)).max() >= np.log(CHANGED) + unsure)
+        clear = max(np.log(CHANGED), SURE * np.sqrt(MAD_VARIANCE / windows))
+        differs = bool(np.abs(np.log(found / self.sigma)).max() >= clear)
         if differs or not self._trusted:
             self.found = found
         if differs:
