@@ -13,6 +13,7 @@ from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretches
 from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics import BallModel, Surfaces, rollout
+from ballfg.estimation.measurement.as_measured import measured_positions, true_times
 from ballfg.state import SPIN, VZ
 
 MARGIN = 0.25
@@ -68,41 +69,45 @@ def planned_flights(
     Args: settings: (m, s) launcher settings, as in the stretches of the dataset.
     Returns: the flights that are long enough, and (m,) a mask of them.
     """
-    times = torch.arange(0.0, view.duration + 0.5 * view.interval, view.interval, dtype=torch.float64)
+    stamps = np.arange(0.0, view.duration + 0.5 * view.interval, view.interval)
+    times, n, k = true_times(model, stamps), len(starts), len(stamps)
     with torch.no_grad():
-        paths = rollout(model, torch.from_numpy(starts), times, surfaces)
+        paths = rollout(model, torch.from_numpy(starts), torch.from_numpy(times), surfaces)
         heights = surfaces.level_below(paths, model.surface_offset(paths))
-        gaps = model.gap(paths, heights).numpy()
-    states, n, k = paths.numpy(), len(starts), len(times)
+        gaps, labels = model.gap(paths, heights).numpy(), model.labelled(paths[:, 0, SPIN]).numpy()
+    measured = measured_positions(model, paths.flatten(0, 1), surfaces).numpy().reshape(n, k, 3)
     lengths, contacts, levels = np.zeros(n, dtype=np.int64), *(np.full((n, MOST_CONTACTS), np.nan) for _ in range(2))
-    for i, path in enumerate(states):
-        lengths[i], met = _seen(path, gaps[i], view)
-        delay = np.clip(gaps[i, met] / -path[met, VZ], 0.0, view.interval)
-        contacts[i, : len(met)] = times.numpy()[met] + delay
+    for i, path in enumerate(paths.numpy()):
+        lengths[i], met = _seen(path, measured[i], gaps[i], np.diff(times), view)
+        delay = np.clip(gaps[i, met] / -path[met, VZ], 0.0, np.diff(times)[met])
+        contacts[i, : len(met)] = times[met] + delay
         levels[i, : len(met)] = heights.numpy()[i, met]
     index = np.minimum(np.arange(k), lengths[:, None] - 1).clip(0)
     seen = (np.arange(k) < lengths[:, None])[..., None]
     rows = {
-        "times": times.numpy()[index],
-        "positions": np.take_along_axis(states[..., :3], index[..., None], axis=1),
+        "times": stamps[index],
+        "positions": np.take_along_axis(measured, index[..., None], axis=1),
         "sigmas": np.where(seen, view.sigmas, np.inf),
         "starts": starts,
         "heights": levels,
         "contacts": contacts,
-        "labels": states[:, 0, SPIN] if view.labelled else np.full((n, 3), np.nan),
+        "labels": labels if view.labelled else np.full((n, 3), np.nan),
     }
     tensors = {name: torch.from_numpy(np.ascontiguousarray(row, dtype=np.float64)) for name, row in rows.items()}
     kept = lengths >= LEAST_SAMPLES
     return Stretches(tuple(map(str, range(n))), np.arange(n), settings, **tensors).take(kept), kept
 
 
-def _seen(path: Array, gaps: Array, view: View) -> tuple[int, Index]:
-    """Number of visible samples of a path (k, 9), and the samples (c,) before contacts."""
-    inside = ((path[:, :3] >= view.low) & (path[:, :3] <= view.high)).all(axis=1)
+def _seen(path: Array, measured: Array, gaps: Array, steps: Array, view: View) -> tuple[int, Index]:
+    """Number of visible samples of a path, and the samples (c,) before contacts.
+
+    Args: path, measured: (k, 9) states and (k, 3) m.  gaps: (k,) m above the surface.  steps: (k - 1,) s between them.
+    """
+    inside = ((measured >= view.low) & (measured <= view.high)).all(axis=1)
     end = len(path) if inside.all() else int(np.argmin(inside))
-    before, after = path[: end - 1, VZ], path[1:end, VZ]
-    near = gaps[: end - 1] < 1.5 * view.interval * np.abs(before)
-    met = np.flatnonzero((before < 0.0) & (after > 0.0) & (after - before > LEAST_KICK) & near)
+    before, after = path[:-1, VZ], path[1:, VZ]
+    near = gaps[:-1] < 1.5 * steps * np.abs(before)
+    met = np.flatnonzero(((before < 0.0) & (after > 0.0) & (after - before > LEAST_KICK) & near)[: max(end - 1, 0)])
     slow = np.flatnonzero(after[met] < 0.5 * LEAST_KICK)
     last = min([MOST_CONTACTS, *slow.tolist()])
     return (int(met[last]) + 1, met[:last]) if len(met) > last else (end, met)

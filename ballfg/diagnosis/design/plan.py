@@ -220,12 +220,17 @@ def _fit_of_all(model: AnalyticModel, holdout: Holdout) -> Fit:
 
 
 def _launcher(fit: Fit, tracks: Sequence[Track], names: tuple[str, ...]) -> LauncherMap:
-    """The launcher's map, from the first states of tracks with all its settings as labels."""
-    labels = {track.name: track.labels for track in tracks}
-    stretches = fit.problem.stretches
+    """The launcher's map, from the first states of tracks with all its settings as labels.
+
+    A first stretch that starts later on, as behind a hit, does not show what the launcher did.
+    """
+    named, stretches = {track.name: track for track in tracks}, fit.problem.stretches
     firsts = np.unique(stretches.track, return_index=True)[1]
-    told = [i for i in firsts if all(isinstance(labels[stretches.names[i]].get(n), float | int) for n in names)]
-    rows = [[float(labels[stretches.names[i]][n]) for n in names] for i in told]
+    begun = stretches.positions[:, 0].numpy()
+    launched = [i for i in firsts if (begun[i] == named[stretches.names[i]].positions[0]).all()]
+    labels = {i: named[stretches.names[i]].labels for i in launched}
+    told = [i for i in launched if all(isinstance(labels[i].get(name), float | int) for name in names)]
+    rows = [[float(labels[i][name]) for name in names] for i in told]
     return learn_launcher(names, np.array(rows).reshape(-1, len(names)), fit.unknowns.starts[told])
 
 

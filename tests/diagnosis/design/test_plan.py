@@ -17,11 +17,12 @@ from ballfg.diagnosis import design_shots, hold_out
 from ballfg.diagnosis.design.choice import combinations, parse_levels
 from ballfg.diagnosis.design.goal import hypothesis_of, separating, shrinking
 from ballfg.diagnosis.design.information import View, planned_flights
-from ballfg.diagnosis.design.plan import ShotPlan, _fit_of_all, learn_launcher
+from ballfg.diagnosis.design.plan import ShotPlan, _fit_of_all, _launcher, learn_launcher
 from ballfg.diagnosis.fit.fit import covariance_of, fit_problem
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.search.refits import with_hypothesis
-from ballfg.dynamics import nominal_model
+from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.settings import all_settings
 from ballfg.tracks import Dataset, Track
@@ -117,6 +118,22 @@ def test_shots_will_lose_as_many_frames_as_the_tracks_did(tmp_path: Path) -> Non
     assert sigmas[1] / sigmas[0] == pytest.approx(1 / np.sqrt(share), rel=0.08)
 
 
+def test_a_track_that_begins_late_does_not_say_where_the_launcher_stands(tmp_path: Path) -> None:
+    """A hit that cuts off the first eight samples must not move the launcher by the way that the ball flew in them."""
+    rng = np.random.default_rng(8)
+    tracks = shots(GRID[rng.integers(len(GRID), size=9)], 8)
+    late = tracks[4].positions.copy()
+    late[:8] += np.linspace(-8.0, 0.0, 8)[:, None] * (0.1, 0.05, 0.05)  # as if it came from elsewhere, to be hit
+    dataset = dataset_of(tmp_path / "shots", [*tracks[:4], replace(tracks[4], positions=late), *tracks[5:]])
+    model = nominal_model(dataset.ball)
+    holdout = hold_out(dataset, model)
+    fit = _fit_of_all(model, holdout)
+    begins = fit.unknowns.starts[fit.problem.stretches.names.index("004"), :3]
+    assert np.linalg.norm(begins - tracks[4].positions[0]) > 0.1
+    places = _launcher(fit, holdout.tracks, NAMES).states(GRID)[:, :3]
+    np.testing.assert_allclose(places, np.broadcast_to(tracks[0].positions[0], places.shape), atol=0.03)
+
+
 NAMES = ("topspin", "sidespin", "speed")
 STEADY = {"position_spread": 0.0, "speed_spread": 0.0, "aim_spread": 0.0, "spin_spread": 0.0}
 
@@ -165,3 +182,35 @@ def test_planned_flights_are_those_that_are_shot() -> None:
         bounces = (np.diff(shot.true_states[:both, 5]) > 0.5).sum()
         assert int(flights.contacts[number].isfinite().sum()) == bounces
     assert isinstance(flights.times, torch.Tensor)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        ["frame_tilt.x=0.05", "frame_tilt.y=-0.1", "scale.y=0.1"],
+        ["time_offset.x=0.004", "velocity_lag.lag=0.003"],
+        ["time_scale.s=0.2", "spin_label_scale.s=0.5"],
+    ],
+)
+def test_planned_flights_are_measured_as_those_that_are_shot(effects: list[str]) -> None:
+    kind, measured = table_tennis(), parse_effects(effects)
+    kind = replace(kind, launcher=kind.launcher.with_fields(STEADY))
+    noise = MeasurementNoise(position=0.0, spin=0.0)
+    simulated = list(simulate(SimulationConfig(20, ball=kind, seed=4, noise=noise, undeclared=measured)))
+    starts = np.stack([s.true_states[0] for s in simulated])
+    model = AnalyticModel([*kind.model.flight.values(), *kind.model.bounce.values(), *measured])
+    interval = float(np.diff(simulated[0].track.times).mean())
+    everywhere = np.full(3, -9.0), np.full(3, 9.0)
+    view = View(*everywhere, 1.3, interval, np.full(3, 0.003), labelled=True)
+    flights, kept = planned_flights(model, starts, np.zeros((20, 0)), kind.surfaces, view)
+    assert kept.all()
+    fitted = predict(model, flights, starts, {})
+    for number, shot in enumerate(simulated):
+        used = flights.used[number].numpy()
+        count = min(used.sum(), len(shot.track))
+        assert count > 50
+        np.testing.assert_allclose(flights.positions[number][:count], shot.track.positions[:count], atol=2e-5)
+        # the last sample may be read behind a contact that the stretch leaves out
+        np.testing.assert_allclose(fitted.positions[number, : count - 1], shot.track.positions[: count - 1], atol=2e-5)
+        np.testing.assert_allclose(flights.times[number][:count], shot.track.times[:count], atol=1e-9)
+        np.testing.assert_allclose(flights.labels[number], shot.track.spin_label, atol=1e-9)
