@@ -320,6 +320,12 @@ def graph(
     from ballfg.estimation.flights.estimates import Seen
 
     found = estimator_for(track, "smoother", model, surfaces, settings).of(track)
+    if not found.model.measures_plainly:
+        raise ValueError(
+            "model must have no measurement effects for a graph, whose factors hold true positions. Correct positions "
+            "and stamps of the track, and leave the model's section measurement empty; or call bf.estimate, which "
+            "undoes the effects, with GTSAM too (settings.solver)."
+        )
     smoother = Smoother(found.model, found.surfaces, found.settings)
     if not Seen.of(smoother, track).whole:  # its graph would explain a ball in a hand by flight and hits
         raise ValueError(
