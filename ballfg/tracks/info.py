@@ -305,7 +305,9 @@ def _checked_extent(extent: Any) -> tuple[float, ...]:
 
 def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
     if key in content and content[key] is None:
-        raise ValueError(f"{prefix}{key} is required; nothing stands after {shown(f'{key}:')}. Write its value there.")
+        problem = f"{prefix}{key} is required; nothing stands after {shown(f'{key}:')}"
+        none = f", or {NO_SURFACE} where balls meet no surface" * (key == "table_height")
+        raise ValueError(f"{problem}. Write its value there{none}.")
     if key not in content:
         found = nearest(key, (str(name) for name in content if name not in _KNOWN))
         remedy = f"Add it, or rename {shown(found)}." if found else "Add it."

@@ -60,7 +60,8 @@ def test_a_dataset_without_a_surface(make_folder, tmp_path):
     ("frame", "rule"),
     [
         ("{up: z, table_height: null}", "frame.table_height is required"),
-        ("{up: z, table_height: }", "is required; nothing stands after 'table_height:'. Write its value there."),
+        ("{up: z, table_height: }", "nothing stands after 'table_height:'. Write its value there, or none where balls"),
+        ("{up: , table_height: 0}", "frame.up is required; nothing stands after 'up:'. Write its value there."),
         ("{up: z, table_height: nothing}", "frame.table_height must be a number"),
         ("{up: z, table_height: none, table: {x: [0, 2], y: [0, 1]}}", "frame.table must be absent"),
     ],
