@@ -28,6 +28,7 @@ class TableWriter:
     Floats are written with enough digits to restore the same float64. Memory is bounded by a block. In CSV, a text that
     a spreadsheet would take for a formula (=, +, - or @ at its beginning, and no number) gets an apostrophe in front,
     which ballfg's readers remove; not in columns `plain`, which hold words of a format, such as +x.
+    Messages call the path `name`.
 
     Example:
         with TableWriter("states.csv") as table:
@@ -38,13 +39,13 @@ class TableWriter:
         folder of the path does not exist.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, plain: Sequence[str] = ()) -> None:
-        self.path, self.plain = check_path("path", path), frozenset(plain)
+    def __init__(self, path: str | os.PathLike[str], *, plain: Sequence[str] = (), name: str = "path") -> None:
+        self.path, self.plain = check_path(name, path), frozenset(plain)
         if self.path.suffix.lower() not in ENDINGS:
             raise ValueError(
-                f"path must end in {' or '.join(ENDINGS)}; got {str(path)!r}. Choose the format by the ending."
+                f"{name} must end in {' or '.join(ENDINGS)}; got {str(path)!r}. Choose the format by the ending."
             )
-        check_file(self.path, "path")
+        check_file(self.path, name)
         self._file: BinaryIO | None = None
         self._parquet: pq.ParquetWriter | None = None
         self._schema: pa.Schema | None = None

@@ -103,6 +103,8 @@ def test_the_name_appears_only_at_the_end(tmp_path):
 
 
 def test_bad_paths_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"out must end in \.csv or \.parquet; got 'states\.txt'"):
+        TableWriter("states.txt", name="out")
     with pytest.raises(ValueError, match=r"path must end in \.csv or \.parquet; got 'states\.txt'\. Choose the format"):
         TableWriter("states.txt")
     with pytest.raises(FileNotFoundError, match=r"path must be in an existing folder; .*nowhere is none\. Create it"):

@@ -81,7 +81,7 @@ def design(
     levels = parse_levels(candidates)
     inputs.know_observations(observations_file)
     if out is not None:
-        TableWriter(out)  # refuses a path that cannot be written
+        TableWriter(out, name="out")  # refuses a path that cannot be written
         inputs.check_out(out, dataset)
     opened = inputs.open_inputs(dataset, model, effects_file)
     if not isinstance(opened.model, AnalyticModel):
@@ -108,7 +108,7 @@ def design(
             "error": plan.error[1:],
             "error_random": plan.random[1:],
         }
-        with TableWriter(out) as table:
+        with TableWriter(out, name="out") as table:
             table.write(columns)
         print(f"{out}: {counted(len(plan.settings), 'shot')}")
 
@@ -146,7 +146,7 @@ def _stand(
     if others:
         raise ValueError(f"{cameras} must hold one camera for --stand; it holds {1 + len(others)}. Give one.")
     if out is not None:
-        TableWriter(out)  # refuses a path that cannot be written
+        TableWriter(out, name="out")  # refuses a path that cannot be written
         inputs.check_out(out, dataset)
     opened = inputs.open_inputs(dataset, model, effects_file)
     places = combinations({axis: levels[axis] for axis in "xyz"})
@@ -159,7 +159,7 @@ def _stand(
     if out is not None:
         columns = {axis: [one.place[i] for one in found] for i, axis in enumerate("xyz")}
         columns |= {name: [getattr(one, name) for one in found] for name in ("sigma", "seen", "uncertain")}
-        with TableWriter(out) as table:
+        with TableWriter(out, name="out") as table:
             table.write(columns)
         print(f"{out}: {len(found)} places")
 

@@ -59,7 +59,7 @@ def estimate(
 
     outcome = Outcome()
     rows = hits = flying = 0
-    with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
+    with TableWriter(out, name="out") as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.know_observations(observations_file)
         inputs.check_out(out, dataset)
         opened = inputs.open_source(source, dataset, model, effects_file, ball=ball)

@@ -100,7 +100,7 @@ def predict(
     ahead = None if horizon is None else check_number("horizon", horizon, "s", above=0.0, limit=LONGEST)
     if asked and conformal is not None:
         raise ValueError("conformal must not be given with events: its scales are those of positions. Leave it out.")
-    with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
+    with TableWriter(out, name="out") as table, inputs.workers(cluster, address, jobs) as workers:
         check_observe(observe)
         if save_conformal is not None:
             check_file(save_conformal, "save_conformal")
