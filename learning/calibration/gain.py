@@ -45,7 +45,7 @@ class Gain:
 
     def __str__(self) -> str:
         said = (
-            f"errors change by {100 * self.mean:+.0f} % ({100 * self.low:+.0f} to {100 * self.high:+.0f} %, 95 % "
+            f"errors change by {100 * self.mean:+z.0f} % ({100 * self.low:+z.0f} to {100 * self.high:+z.0f} %, 95 % "
             f"interval over {self.tracks} tracks that were not fitted)"
         )
         if self.density is None:

@@ -44,6 +44,12 @@ def compared(change: float, spread: float = 0.01) -> Comparison:
     return Comparison(*made, 2, np.stack((np.full(3, 0.02), after), axis=1), 0)
 
 
+def test_errors_that_hardly_fall_do_not_change_by_minus_nothing(problem: Problem) -> None:
+    said = verdict(problem, step(problem), compared(-0.003, 0.001))
+    assert "errors change by +0 % (" in said
+    assert "-0 " not in said
+
+
 @pytest.mark.parametrize(
     ("change", "spread", "word"),
     [(-0.5, 0.01, "better"), (0.5, 0.01, "worse"), (-0.5, 1.0, "no different"), (-0.01, 0.0, "no different")],
