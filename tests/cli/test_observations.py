@@ -81,6 +81,12 @@ def test_the_other_commands_take_the_file_too(command: str, shots: Path) -> None
         assert "note: heights.csv is not used: live estimates are made from positions alone" in said
 
 
+def test_the_sliding_window_says_that_it_uses_positions_alone(shots: Path) -> None:
+    with OBSERVATIONS.restored():
+        said = printed(*COMMANDS["estimate"], "--method", "sliding-window", "--observations-file", "laser.py")
+    assert "observations beside positions are not used" in said.out + said.err
+
+
 def test_tables_that_are_no_readings_may_lie_beside_the_tracks(shots: Path) -> None:
     (shots / "heights.csv").rename(shots.parent / "heights.csv")
     (shots / "notes.csv").write_bytes(b"\xff\xfe\x00\nnonsense")

@@ -32,6 +32,7 @@ START_ACCELERATION = 20.0
 """m/s^2, standard deviation of the acceleration of three samples beside gravity: twice a fast ball's drag."""
 FRICTION_SHARE = 0.5
 """Largest change of tangential speed in a bounce, as a share of the normal speed's change: Coulomb's mu."""
+UNUSED = "observations beside positions are not used"
 
 
 class SlidingWindow(Estimator):
@@ -80,7 +81,7 @@ class SlidingWindow(Estimator):
             status=Status.OK if n > 1 else Status.NO_VELOCITY,
             innovations={"position": np.full((n, 3), np.nan)},
             world=self.world,
-            notes=self.doubts(track),
+            notes=self.doubts(track) + (UNUSED,) * any(not one.locates for one in track.observations),
             cross_covariances=np.zeros((n, STATE_DIM, 0)),
         )
         return plausible(estimate, track, sigma, self.settings).dated(written.times)
