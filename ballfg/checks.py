@@ -161,7 +161,8 @@ def check_keys(where: str, content: dict[Any, Any], known: Collection[str], need
             )
     for key in needed:
         if content.get(key) is None:
-            raise ValueError(f"{where}: field {shown(key)} is required; got {listed(content)}. Add it.")
+            rule, empty = f"{where}: field {shown(key)} is required", key in content
+            raise ValueError(f"{rule}; it is empty. Fill it." if empty else f"{rule}; got {listed(content)}. Add it.")
 
 
 def nearest(name: str, candidates: Iterable[str]) -> str | None:

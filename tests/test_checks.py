@@ -148,7 +148,12 @@ def test_what_is_right_comes_back() -> None:
         (
             lambda: check_keys("here", {"name": 1, "size": None}, ("size", "name"), ("size",)),
             ValueError,
-            "here: field 'size' is required; got name, size. Add it.",
+            "here: field 'size' is required; it is empty. Fill it.",
+        ),
+        (
+            lambda: check_keys("here", {"name": 1}, ("size", "name"), ("size",)),
+            ValueError,
+            "here: field 'size' is required; got name. Add it.",
         ),
     ],
 )
