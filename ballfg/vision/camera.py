@@ -16,6 +16,7 @@ DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 _PRECISELY: Final = (3, 60, 1e-12)  # cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 """OpenCV undoes distortion by five steps of a fixed point by default: 0.1 pixel off in a wide lens."""
 LONGEST: Final = 0.1  # s, of an exposure, and until all rows of an image are read
+LATEST: Final = 1e11  # s, of a stamp: 3,000 years
 WIDEST_ASKED: Final = 6.0  # tangent of the angle from the axis up to which a lens is tested: 80 degrees
 WIDEST_STEPS: Final = 6001
 
@@ -83,7 +84,8 @@ class Camera:
             raise ValueError(f"{where}: {rule}; got {k.tolist()}")
         if self.covariance is not None:
             object.__setattr__(self, "covariance", _checked_covariance(where, self.covariance))
-        object.__setattr__(self, "time_offset", check_number(f"{where}: time_offset", self.time_offset, "s"))
+        offset = check_number(f"{where}: time_offset", self.time_offset, "s", limit=LATEST, instead="ns")
+        object.__setattr__(self, "time_offset", offset)
         for field, least in (("readout", -LONGEST), ("exposure", 0.0)):
             seconds = check_number(f"{where}: {field}", getattr(self, field), "s")
             if not least <= seconds <= LONGEST:

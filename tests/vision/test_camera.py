@@ -101,6 +101,7 @@ def test_view_ends_at_the_image() -> None:
         ({"size": (0, 720)}, "size must be width and height in pixels; got .*Correct it."),
         ({"name": " "}, "printable text"),
         ({"time_offset": np.inf}, "time_offset must be finite"),
+        ({"time_offset": 1e12}, "time_offset must be in s"),
         ({"readout": 16.0}, "readout must be -0.1 to 0.1 s; got 16. It is shorter than a frame; give seconds."),
         ({"exposure": -0.01}, "exposure must be 0 to 0.1 s; got -0.01. It is shorter than a frame; give seconds."),
         ({"covariance": np.eye(6)}, "covariance must have shape"),
