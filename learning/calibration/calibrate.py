@@ -229,15 +229,16 @@ def linearised(problem: Problem, last: Step, watch: Watch = unwatched) -> Linear
     settings = replace(settings, coefficients=priors)
     model = with_values(problem.model, chosen.names, about)
     wide = settings if groups is None else groups.wide(settings, spins)
-    kind = Smoother if model.measures_plainly else partial(InvertMeasurement, Smoother)
-    estimator = kind(model, problem.surfaces, wide)  # without variations: those of groups are found anew
     tracks = tracks_of(problem.dataset, names)
     if problem.correction is not None:
         tracks = (track.opening(FIRST) for track in tracks)
     estimates: Iterator[tuple[Estimate, Array | None]]
     if problem.dataset.one_view:
-        estimates = map_tracks(partial(estimate_with_slopes, estimator, chosen.names), tracks, len(names), problem.jobs)
+        smoother = Smoother(model, problem.surfaces, wide)
+        estimates = map_tracks(partial(estimate_with_slopes, smoother, chosen.names), tracks, len(names), problem.jobs)
     else:
+        kind = Smoother if model.measures_plainly else partial(InvertMeasurement, Smoother)
+        estimator = kind(model, problem.surfaces, wide)  # without variations: those of groups are found anew
         estimates = ((one, None) for one in estimate_tracks(estimator, tracks, len(names), problem.jobs))
     fits: list[TrackFit] = []
     evidences: list[Evidence] = []
