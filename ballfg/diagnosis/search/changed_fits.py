@@ -9,7 +9,7 @@ from ballfg.arrays import Mask
 from ballfg.diagnosis.evidence.prior import centres
 from ballfg.diagnosis.evidence.rows import Motion
 from ballfg.diagnosis.evidence.sets import Sets
-from ballfg.diagnosis.evidence.weighed import Weighed, weighed
+from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
 from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_coefficients, without_effect
@@ -109,9 +109,19 @@ def smaller_fit(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:
 
 
 def weighed_without(model: Weighed, gone: Sequence[Hypothesis], first: Fit, motion: Motion, halves: Mask) -> Weighed:
-    """A model without some of its effects, from where `smaller_fit` leads.  Args: as of `smaller_fit`, `weighed`."""
+    """A model without some of its effects, from where `smaller_fit` leads.  Args: as of `smaller_fit`, `weighed`.
+
+    Where that is a poorer minimum than the linearisation foretells, steps of the fit may lead to a better one.
+    """
     kept = [h for h in model.named if h not in gone]
-    return weighed(smaller_fit(model, gone, first), kept, motion, halves, model)
+    found = weighed(smaller_fit(model, gone, first), kept, motion, halves, model)
+    foretold = model.nested.get(model.names - {h.name for h in gone})
+    if foretold is None or found.score > foretold.score - WORTH_A_STEP:
+        return found
+    other = without_named(model.fit, gone, first)
+    if not np.isfinite(other.cost):
+        return found
+    return max(found, weighed(other, kept, motion, halves, model), key=lambda one: one.score)
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:

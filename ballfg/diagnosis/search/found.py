@@ -17,7 +17,7 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.changed_fits import smaller_fit
+from ballfg.diagnosis.search.changed_fits import smaller_fit, weighed_without
 from ballfg.diagnosis.search.evaluation import on_all, on_others
 from ballfg.diagnosis.search.models import WeighedModels
 from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
@@ -272,7 +272,16 @@ def _weighed_refit(
 def _in_place(
     best: Weighed, gone: Hypothesis, candidate: Scored, first: Fit, motion: Motion, halves: Mask
 ) -> tuple[Refit, Weighed]:
-    """The refit of a model with a candidate in the place of one of its effects, and how probable it is."""
+    """The refit of a model with a candidate in the place of one of its effects, and how probable it is.
+
+    The more probable one of two: without the effect first, or with both for a while.
+    """
     refitted = refit(smaller_fit(best, [gone], first), candidate)
     named = (*(h for h in best.named if h.name != gone.name), candidate.hypothesis)
-    return refitted, weighed(refitted.fit, named, motion, halves, best)
+    found = weighed(refitted.fit, named, motion, halves, best)
+    beside = refit(best.fit, candidate)
+    if not np.isfinite(beside.fit.cost):
+        return refitted, found
+    both = weighed(beside.fit, (*best.named, candidate.hypothesis), motion, halves, best)
+    other = weighed_without(both, [gone], first, motion, halves)
+    return (beside, other) if other.score > found.score else (refitted, found)
