@@ -30,9 +30,8 @@ MOST_REJECTED: Final = 2
 """Number of consecutive samples without a fitting hypothesis after which another event is assumed."""
 GATE: Final = 30.664849
 """Squared whitened distance in three dimensions beyond which a position is rejected: one in a million good ones is."""
-FAR: Final = 6.0
-"""Standard deviations of a contact's time beyond which a stamp lies on one side of it. There the other side's chance is
-1e-9 and adds nothing to a variance; at 4 a jump of 7 m/s still adds three times what a velocity is known to."""
+FAR: Final = 4.0
+"""Standard deviations of a contact's time beyond which a stamp lies on one side of it."""
 LEAST_SPEED: Final = 1e-3
 """m/s, least speed across the surface, or jump of the velocity, in the uncertainty of the time of a contact or hit."""
 MORE: Final = 3.0
