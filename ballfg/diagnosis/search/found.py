@@ -279,9 +279,8 @@ def _in_place(
     refitted = refit(smaller_fit(best, [gone], first), candidate)
     named = (*(h for h in best.named if h.name != gone.name), candidate.hypothesis)
     found = weighed(refitted.fit, named, motion, halves, best)
-    beside = refit(best.fit, candidate)
-    if not np.isfinite(beside.fit.cost):
+    beside, both = _weighed_refit(partial(refit, best.fit, candidate), best, motion, halves)
+    if both is None:
         return refitted, found
-    both = weighed(beside.fit, (*best.named, candidate.hypothesis), motion, halves, best)
     other = weighed_without(both, [gone], first, motion, halves)
     return (beside, other) if other.score > found.score else (refitted, found)
