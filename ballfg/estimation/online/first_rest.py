@@ -71,10 +71,8 @@ class FirstRest:
         if self.balls is None or (chance := self._doubt(self.balls, self.rolls)) < LEAST_CHANCE:
             return mean, joint
         other, d = self.balls[not self.rolls], len(mean)
-        near, far = (mean, joint), (other.means[0, :d], other.covariances[0, :d, :d])
-        if chance > 0.5:
-            near, far, chance = far, near, 1.0 - chance
-        return near[0], beside(near, far, chance)
+        near, both = beside((mean, joint), (other.means[0, :d], other.covariances[0, :d, :d]), chance)
+        return near[0], both
 
     @staticmethod
     def _doubt(balls: tuple[GaussianMixture, GaussianMixture], rolls: bool) -> float:

@@ -135,10 +135,7 @@ class Newest:
         found = self.rest.step(self.monitor.model, before, dt, measured, level)
         if found is None:
             return state
-        chance, near, far = found[0], (state.mean, state.joint), (found[1][:d], found[2][:d, :d])
-        if chance > 0.5:
-            near, far, chance = far, near, 1.0 - chance
-        joint = beside(near, far, chance)
+        near, joint = beside((state.mean, state.joint), (found[1][:d], found[2][:d, :d]), found[0])
         return replace(state, mean=near[0], joint=joint, struck=joint - near[1])
 
     def _state(self, window: StreamWindow, sample: Sample, contact: ContactState | None, update: Update) -> OnlineState:

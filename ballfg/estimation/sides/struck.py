@@ -187,10 +187,14 @@ def weighed(
     return GaussianMixture.concatenated([good.divided(-math.log1p(-share)), outliers.divided(-math.log(share))])
 
 
-def beside(near: tuple[Array, Array], far: tuple[Array, Array], chance: float) -> Array:
-    """(d, d) second moment about the mean of the one Gaussian, of a mixture with a share `chance` of the other."""
+def beside(one: tuple[Array, Array], other: tuple[Array, Array], chance: float) -> tuple[tuple[Array, Array], Array]:
+    """The more probable one of two Gaussians, and the second moment (d, d) of both about its mean.
+
+    Args: one, other: means (d,) and covariances (d, d).  chance: of the other.
+    """
+    near, far, chance = (one, other, chance) if chance <= 0.5 else (other, one, 1.0 - chance)
     jump = far[0] - near[0]
-    return np.asarray((1.0 - chance) * near[1] + chance * (far[1] + np.outer(jump, jump)))
+    return near, np.asarray((1.0 - chance) * near[1] + chance * (far[1] + np.outer(jump, jump)))
 
 
 def _share_kept(earlier: GaussianMixture, later: GaussianMixture, world: Array) -> float:

@@ -162,10 +162,8 @@ def _fallen(
         rolling = rolled.means[0], rolled.covariances[0]
     if found is None:
         return None
-    chance, near, far = found[0], rolling, found[1:]
-    if chance > 0.5:
-        near, far, chance = far, near, 1.0 - chance
-    return near[0][:d], beside(near, far, chance)[:d, :d]
+    near, both = beside(rolling, found[1:], found[0])
+    return near[0][:d], both[:d, :d]
 
 
 def _at_end(
