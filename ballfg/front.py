@@ -1,7 +1,6 @@
 """The front door estimates, predicts and diagnoses from arrays, tracks, datasets and folders alike."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -357,27 +356,11 @@ def estimator_for(
     if settings is None and source is not None:
         settings = fitted_settings(source, ball, observed)
     elif settings is None:
-        settings = Settings.for_measured(ball)
-        make_estimator(method, ball, surfaces, settings).prepared(cast(Track, data))  # refuses what is no track
-        settings = _with_shown_noise(settings, cast(Track, data), ball)
+        from ballfg.estimation.flights.estimates import with_shown_noise
+
+        usual = make_estimator(method, ball, surfaces, Settings.for_measured(ball))
+        settings = with_shown_noise(usual, cast(Track, data))
     return make_estimator(method, ball, surfaces, settings)
-
-
-def _with_shown_noise(settings: Settings, track: Track, ball: BallModel) -> Settings:
-    """Settings for a track without a dataset: the scatter of its flights gives the noise of its positions."""
-    from ballfg.estimation.flights.labels import label_samples
-    from ballfg.estimation.measurement.position_noise import estimate_position_noise
-    from ballfg.estimation.result import Label
-    from ballfg.estimation.segmentation.physics import physics_of
-
-    if track.sigmas is not None or track.rough or ball.states_position_noise:
-        return settings
-    labels = label_samples(track, physics_of(ball))
-    flying = labels.values == Label.FLIGHT  # not at rest, where the noise may be another one, nor outliers
-    runs = (first + np.flatnonzero(flying[first : last + 1]) for first, last in labels.stretches(Label.FLIGHT))
-    flights = [Track(track.times[run], track.positions[run]) for run in runs]
-    x, y, z = estimate_position_noise(flights or [track]).tolist()
-    return replace(settings, position_noise=(x, y, z))
 
 
 def _model(model: Model, source: "Tracks | None") -> BallModel:

@@ -10,10 +10,11 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.flights.labels import SHORTEST, Labels, label_samples
+from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.plausible import measured_only
 from ballfg.estimation.result import Estimate, Label, Status
 from ballfg.estimation.segmentation.physics import physics_of
-from ballfg.estimation.settings import sample_sigmas
+from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
@@ -61,6 +62,21 @@ def estimated(estimator: Estimator, track: Track) -> Estimate:
     """The estimate of a track with its labels; a track that only flies is estimated as a whole."""
     seen = Seen.of(estimator, track)
     return seen.labelled(estimator.estimate(track)) if seen.whole else seen.estimated(estimator)
+
+
+def with_shown_noise(estimator: Estimator, track: Track) -> Settings:
+    """The settings of an estimator, with the noise of positions that the scatter of a track's flights shows.
+
+    As they are for positions whose noise is known. Raises: as `Estimator.prepared`.
+    """
+    if track.sigmas is not None or track.rough or estimator.model.states_position_noise:
+        return estimator.settings
+    labels = Seen.of(estimator, track).labels
+    flying = labels.values == Label.FLIGHT  # not at rest, where the noise may be another one, nor outliers
+    runs = (first + np.flatnonzero(flying[first : last + 1]) for first, last in labels.stretches(Label.FLIGHT))
+    flights = [Track(track.times[run], track.positions[run]) for run in runs]
+    x, y, z = estimate_position_noise(flights or [track]).tolist()
+    return replace(estimator.settings, position_noise=(x, y, z))
 
 
 def in_sections(estimator: Estimator, track: Track) -> Iterator[Estimate]:
