@@ -11,8 +11,7 @@ from contextlib import contextmanager
 import pytest
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
-from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.compiled import in_torch, motion
+from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.compiled.functions import CompiledModel
 from ballfg.machine import collect_rarely
 from ballfg.progress import VARIABLE
@@ -42,18 +41,13 @@ def every_effect() -> AnalyticModel:
 
 @contextmanager
 def _in_torch() -> Iterator[None]:
-    machine_code, of_beliefs = motion.functions_of, in_torch.compiled
-
-    def functions_of(model: BallModel) -> CompiledModel | None:
-        alone = model.model if isinstance(model, AugmentedModel) else model
-        return machine_code(model) if isinstance(alone, AnalyticModel) else None
+    machine_code = motion.compiled
 
     def compiled(model: BallModel) -> CompiledModel | None:
-        return of_beliefs(model) if isinstance(model, AnalyticModel) else None
+        return machine_code(model) if isinstance(model, AnalyticModel) else None
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motion, "functions_of", functions_of)
-        patch.setattr(in_torch, "compiled", compiled)
+        patch.setattr(motion, "compiled", compiled)
         yield
 
 

@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-import torch
+import numpy as np
 from numba.extending import register_jitable
-from torch import Tensor
 
 from ballfg.checks import check_array, check_number, is_number
 from ballfg.dynamics.motion.limits import DEEPEST
@@ -78,36 +77,46 @@ class Surfaces:
         known = (self.table_height, -math.inf if self.floor_height is None else self.floor_height)
         return tuple(height for height in known if height > -math.inf)
 
-    def over_table(self, state: Tensor) -> Tensor:
-        """(...) bool of states (..., 9): the ball's x, y lie within the table's extent."""
+    def over_table(self, state: Any) -> Any:
+        """(...) bool of states (..., 9), an array or a tensor: the ball's x, y lie within the table's extent."""
         if self.extent is None:
-            return torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
-        over: Tensor = within(state[..., 0], state[..., 1], self.extent)
-        return over
+            return (state[..., 0] == state[..., 0]) | True
+        return within(state[..., 0], state[..., 1], self.extent)
 
-    def height_below(self, state: Tensor, raised: Tensor | float) -> Tensor:
+    def height_below(self, state: Any, raised: Any) -> Any:
         """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.
 
         A ball whose centre is below the table's surface is beside the table; `level_below` limits its depth.
 
-        Args: raised: as of `level_below`.
+        Args: state, raised: as of `level_below`.
         """
-        return torch.where(self.over_table(state), self.level_below(state, raised), self._lower_level(state, raised))
+        return _where(self.over_table(state), self.level_below(state, raised), self._lower_level(state, raised))
 
-    def level_below(self, state: Tensor, raised: Tensor | float) -> Tensor:
+    def level_below(self, state: Any, raised: Any) -> Any:
         """(...) m, height of the surface that a ball in states (..., 9) falls to, on the table or beside it.
 
         -inf where there is none: below the lowest surface by more than `DEEPEST`.
 
-        Args: raised: (...) m by which surfaces lie above their declared heights there (`BallModel.surface_offset`).
+        Args:
+            state: an array or a tensor.
+            raised: (...) m by which surfaces lie above their declared heights there (`BallModel.surface_offset`).
         """
         above = state[..., Z] - raised > self.table_height
-        return torch.where(above, state.new_tensor(self.table_height), self._lower_level(state, raised))
+        return _where(above, self.table_height, self._lower_level(state, raised))
 
-    def _lower_level(self, state: Tensor, raised: Tensor | float) -> Tensor:
+    def _lower_level(self, state: Any, raised: Any) -> Any:
         low = self.lowest()
-        return torch.where(state[..., Z] - raised > low - DEEPEST, state.new_tensor(low), state.new_tensor(-math.inf))
+        return _where(state[..., Z] - raised > low - DEEPEST, low, -math.inf)
 
     def lowest(self) -> float:
         """m, height of the lowest surface under a ball beside the table; -inf where there is none."""
         return -math.inf if self.floor_height is None else self.floor_height
+
+
+def _where(mask: Any, yes: Any, no: Any) -> Any:
+    """Choices by a mask, in torch for a tensor's."""
+    if isinstance(mask, np.ndarray | np.bool_):
+        return np.where(mask, yes, no)
+    import torch
+
+    return torch.where(mask, *(torch.as_tensor(one, dtype=torch.float64, device=mask.device) for one in (yes, no)))

@@ -20,7 +20,7 @@ from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, density_of
 from ballfg.dynamics.compiled.beliefs.edges import share_over_table
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
+from ballfg.dynamics.motion.arrays import advance_jacobian
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import fly, fly_jacobian
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, NEGLIGIBLE, steps_over_each
@@ -198,15 +198,16 @@ class Propagator:
         It also returns the height (m) of the surface of a single bounce, else NaN.
         """
         dt = torch.tensor([h], dtype=torch.float64)
-        motion = advance_jacobian(model, mean, h, self.surfaces)
+        motion = advance_jacobian(model, mean[0].numpy(), h, self.surfaces)
+        jacobian = torch.from_numpy(motion.jacobian)
         noise = torch.from_numpy(self.noise.flight(dt.numpy()))
         if motion.contacts:
             times = mean.new_tensor([[time for time, _ in motion.contacts]])
-            noise = self._bounce_noise(model, mean, dt, times, motion.jacobian[None])
+            noise = self._bounce_noise(model, mean, dt, times, jacobian[None])
         noise = noise + _edge_doubt(model, mean, covariance, dt, self.surfaces)
-        spread = _carried(motion.jacobian, covariance, noise)
+        spread = _carried(jacobian, covariance, noise)
         height = motion.contacts[0][1] if len(motion.contacts) == 1 else math.nan
-        return (motion.after[0].numpy(), spread[0].numpy()), height
+        return (motion.after, spread[0].numpy()), height
 
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s of free flight, without surfaces."""

@@ -21,8 +21,9 @@ from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.in_c.routines import Routine, Translator
 from ballfg.dynamics.compiled.in_c.values import UntranslatableError
-from ballfg.dynamics.compiled.motion import Moving, fly_jacobian, world_of
+from ballfg.dynamics.compiled.motion import Moving, world_of
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.by_machine_code import fly_jacobian
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState, Belief, Propagator, plane_crossing
 from ballfg.prediction.c_header import c_header
@@ -139,7 +140,7 @@ def test_contacts(in_c: InC) -> None:
     assert 0 < found < n
     assert functions is not None
     for i in range(n):  # one by one: those of a batch share their number of integration steps
-        ball = Moving(in_c.model, functions, torch.from_numpy(x[i : i + 1]), 9)
+        ball = Moving(in_c.model, functions, x[i : i + 1], 9)
         given = (*ball.addresses, x[i : i + 1], np.eye(9)[None], *ball.all_coefficients(), *ball.weights)
         tau, bounced, by_state = np.empty(1), np.empty((1, 9)), np.empty((1, 9, 9))
         level, longest = np.full(1, 0.1), np.full(1, 0.5)

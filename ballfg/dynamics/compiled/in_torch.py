@@ -3,7 +3,6 @@
 Prediction then runs the same code for every model, only more slowly.
 """
 
-import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,9 +16,9 @@ from numba import njit, objmode, types
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.build import Code
-from ballfg.dynamics.compiled.functions import PARTS, CompiledModel, Function, compiled
+from ballfg.dynamics.compiled.functions import PARTS, CompiledModel, Function
+from ballfg.dynamics.compiled.motion import FAILED
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.signatures import ONE, THREE, TWO
 from ballfg.dynamics.model import BallModel, substitute
@@ -29,18 +28,8 @@ SIZES: Final = (6, 9, 3, 6)  # Number of outputs of rates, impact, surface and r
 _asked: dict[int, Callable[[Tensor, Tensor], Tensor]] = {}
 
 
-class _Failed(threading.local):
-    """Errors that the machine code of this thread has met."""
-
-    def __init__(self) -> None:
-        self.errors: list[Exception] = []
-
-
-_failed = _Failed()
-
-
 def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
-    """Computes one function; an error waits for `raise_errors`, since machine code cannot pass it on."""
+    """Computes one function; an error waits for `motion.raise_errors`, since machine code cannot pass it on."""
     try:
         given = (torch.from_numpy(np.array(x)), torch.from_numpy(np.array(c)))
         if not xt.shape[1]:
@@ -58,7 +47,7 @@ def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
             if slope is not None:
                 yt += slope.numpy() @ moved
     except Exception as error:
-        _failed.errors.append(error)
+        FAILED.errors.append(error)
         y[:], yt[:] = np.nan, np.nan
 
 
@@ -101,12 +90,6 @@ def in_torch(model: BallModel) -> InTorch:
     return _made[model]
 
 
-def functions_for(model: BallModel) -> CompiledModel:
-    """The functions of a model, whose coefficients may travel: machine code where there is any, else torch."""
-    inner = model.model if isinstance(model, AugmentedModel) else model
-    return compiled(inner) or in_torch(inner)
-
-
 def _value(
     known: weakref.ref[BallModel],
     part: Callable[[BallModel, Tensor], Tensor],
@@ -118,11 +101,3 @@ def _value(
     assert model is not None, "whoever computes with a model keeps it"
     values = coefficients.unbind() if state.dim() == 1 else coefficients.split(1, dim=1)
     return part(substitute(model, dict(zip(names, values, strict=True))), state)
-
-
-def raise_errors() -> None:
-    """Raises the error that torch raised while machine code was running."""
-    if _failed.errors:
-        first = _failed.errors[0]
-        _failed.errors.clear()
-        raise first

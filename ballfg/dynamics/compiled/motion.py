@@ -1,13 +1,12 @@
 """Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
 import copy
+import threading
 import weakref
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.augmented import AugmentedModel
@@ -15,7 +14,6 @@ from ballfg.dynamics.compiled.contacts import coefficients_of, contact_times, tr
 from ballfg.dynamics.compiled.functions import CompiledModel, compiled
 from ballfg.dynamics.compiled.ground import advance_one, roll_rows
 from ballfg.dynamics.compiled.places import Numbers, numbers_of
-from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import MAX_CONTACTS, steps_over
 from ballfg.dynamics.surfaces import Surfaces
@@ -32,9 +30,9 @@ class Moving:
         start: (n, 9 + p), not changed.  width: d, 9 + p, or 0 for no derivatives.
     """
 
-    def __init__(self, model: BallModel, functions: CompiledModel, start: Tensor | Array, width: int) -> None:
+    def __init__(self, model: BallModel, functions: CompiledModel, start: Array, width: int) -> None:
         inner, names = (model.model, model.names) if isinstance(model, AugmentedModel) else (model, ())
-        self.functions, self.start, self.width = functions, _plain(start), width
+        self.functions, self.start, self.width = functions, np.ascontiguousarray(start, dtype=np.float64), width
         *self.addresses, self._rolling = functions.addresses
         *self.weights, self._rolling_weights = functions.weights(inner)
         self._own, self._places = _present(inner, functions, names)
@@ -75,6 +73,10 @@ class Moving:
         by_state = -slopes[:, 0]
         by_state[:, Z : Z + 1] += 1.0 if self.width else 0.0
         return self.start[:, Z] - height - offset[:, 0] - self.functions.radius, by_state
+
+    def offsets(self) -> Array:
+        """(n,) m by which surfaces lie above their declared heights under the balls."""
+        return self._value(SURFACE)[0][:, 0]
 
     def rates(self) -> Array:
         """(n, 6) m/s^2 and rad/s^2 in flight at the start."""
@@ -181,19 +183,6 @@ def _places(names: tuple[str, ...], travelling: tuple[str, ...]) -> Index:
     return np.array([STATE_DIM + travelling.index(n) if n in travelling else -1 for n in names], dtype=np.int64)
 
 
-def _plain(given: Tensor | Array) -> Array:
-    """Numbers for machine code: contiguous, in double precision."""
-    return np.ascontiguousarray(given.detach().numpy() if isinstance(given, Tensor) else given, dtype=np.float64)
-
-
-def _levels(state: Tensor, heights: Sequence[Tensor | float] = ()) -> Array:
-    """(n, k) m from k heights of surfaces, each in m or (n,), for n states."""
-    levels = np.empty((len(state), len(heights)))
-    for k, height in enumerate(heights):
-        levels[:, k] = height.numpy() if isinstance(height, Tensor) else height
-    return levels
-
-
 def functions_of(model: BallModel) -> CompiledModel | None:
     """The functions of a model, also for coefficients that travel with the state.
 
@@ -206,90 +195,43 @@ def functions_of(model: BallModel) -> CompiledModel | None:
     return compiled(model)
 
 
-def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
-    """As `integrate.fly`, without derivatives."""
-    if state.dim() == 2 and dt.shape == state.shape[:1]:
-        return torch.from_numpy(Moving(model, functions, state, 0).travel(_plain(dt), _levels(state))[0])
-    shape = np.broadcast_shapes(state.shape[:-1], dt.shape)  # torch's own imports sympy, which takes a second
-    rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
-    durations = _plain(dt.detach().expand(shape).reshape(-1))
-    after, _, _ = Moving(model, functions, rows, 0).travel(durations, _levels(rows))
-    return torch.from_numpy(after).reshape(*shape, state.shape[-1])
-
-
-def contact_time(
-    model: BallModel, functions: CompiledModel, state: Tensor, height: Tensor | float, longest: Tensor | float
-) -> Tensor:
-    """As `contact.contact_time`, without derivatives."""
-    shape = state.shape[:-1]
-    moving = Moving(model, functions, state.detach().reshape(-1, state.shape[-1]), 0)
-    return torch.from_numpy(moving.meets(*(_numbers(given, shape) for given in (height, longest)))).reshape(shape)
-
-
-def roll(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
-    """As `rollout.roll`, without derivatives."""
-    shape = np.broadcast_shapes(state.shape[:-1], dt.shape)
-    rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
-    durations, levels = (_numbers(given, torch.Size(shape)) for given in (dt, height))
-    after, _ = Moving(model, functions, rows, 0).roll(durations, levels)
-    return torch.from_numpy(after).reshape(*shape, state.shape[-1])
-
-
-def roll_jacobian(
-    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, height: Tensor | float
-) -> tuple[Tensor, Tensor]:
-    """As `rollout.roll_jacobian`."""
-    moving = Moving(model, functions, state, state.shape[-1])
-    after, jacobian = moving.roll(_plain(dt), _numbers(height, dt.shape))
-    return torch.from_numpy(after), torch.from_numpy(jacobian)
-
-
-def roll_out(model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor:
-    """Durations (n, k) s one after another, as in `rollout.rollout`: states (n, k, 9)."""
-    n, width = state.shape
-    moving = Moving(model, functions, state, 0)
-    states = np.empty((n, steps.shape[1], STATE_DIM))
-    durations, world = np.ascontiguousarray(steps.detach().numpy()), world_of(surfaces, functions.radius)
-    roll_out_rows(*moving.laws, np.ascontiguousarray(moving.start[:, :STATE_DIM]), durations, world, states)
-    if width > STATE_DIM:
-        travelling = np.broadcast_to(moving.start[:, None, STATE_DIM:], (n, steps.shape[1], width - STATE_DIM))
-        states = np.concatenate((states, travelling), axis=2)
-    return torch.from_numpy(states)
-
-
 def world_of(surfaces: Surfaces, radius: float) -> Array:
     """(11,) m: heights of table and floor, radius, the table's ends, their standard deviations, for machine code."""
     ends = surfaces.extent or (-np.inf, np.inf, -np.inf, np.inf)
     return np.array([surfaces.table_height, surfaces.lowest(), radius, *ends, *surfaces.edge_sigmas])
 
 
-def _numbers(given: Tensor | float, shape: torch.Size) -> Array:
-    """(n,) from a scalar or from one number per ball."""
-    if isinstance(given, Tensor):
-        return np.ascontiguousarray(given.detach().expand(shape).reshape(-1).numpy(), dtype=np.float64)
-    return np.full(shape.numel(), given, dtype=np.float64)
+def levels(count: int, heights: Sequence[Array | float] = ()) -> Array:
+    """(n, k) m from k heights of surfaces, each in m or (n,), for n states."""
+    found = np.empty((count, len(heights)))
+    for k, height in enumerate(heights):
+        found[:, k] = height
+    return found
 
 
-def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
-    """As `integrate.fly_jacobian`."""
-    shape, width = state.shape, state.shape[-1]
-    rows, durations = (state, dt) if dt.dim() == 1 else (state.reshape(-1, width), dt.reshape(-1))
-    after, jacobian, _ = Moving(model, functions, rows, width).travel(_plain(durations), _levels(rows))
-    return torch.from_numpy(after.reshape(shape)), torch.from_numpy(jacobian.reshape(*shape, width))
+def functions_for(model: BallModel) -> CompiledModel:
+    """The functions of a model, whose coefficients may travel: machine code where there is any, else torch."""
+    inner = model.model if isinstance(model, AugmentedModel) else model
+    if (functions := compiled(inner)) is not None:
+        return functions
+    from ballfg.dynamics.compiled.in_torch import in_torch
+
+    return in_torch(inner)
 
 
-def fly_through(
-    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
-) -> tuple[Tensor, Tensor]:
-    """As `contact.fly_through`, without derivatives."""
-    after, _, times = Moving(model, functions, state, 0).travel(_plain(dt), _levels(state, heights))
-    return torch.from_numpy(after), torch.from_numpy(times)
+class _Failed(threading.local):
+    """Errors that the machine code of this thread has met."""
+
+    def __init__(self) -> None:
+        self.errors: list[Exception] = []
 
 
-def fly_through_jacobian(
-    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As `contact.fly_through_jacobian`."""
-    moving = Moving(model, functions, state, state.shape[-1])
-    after, jacobian, times = moving.travel(_plain(dt), _levels(state, heights))
-    return torch.from_numpy(after), torch.from_numpy(times), torch.from_numpy(jacobian)
+FAILED: Final = _Failed()
+
+
+def raise_errors() -> None:
+    """Raises the error that torch raised while machine code was running."""
+    if FAILED.errors:
+        first = FAILED.errors[0]
+        FAILED.errors.clear()
+        raise first

@@ -4,20 +4,17 @@ The contact time is a function of the state. A search finds it without a graph; 
 Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up
 to the third, so that both the saltation term of a Jacobian and the Hessian of a loss come out of autograd right
 (docs/derivations/contact.md).
-
-`PreparedMotion` is for callers that move the balls of one model often.
 """
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.arrays import Array, plain
+from ballfg.arrays import Array
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion import limits
+from ballfg.dynamics.motion import by_machine_code, limits
 from ballfg.dynamics.motion.flight_step import rk4_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian, followed, is_plain
 from ballfg.state import Z
@@ -47,7 +44,7 @@ def _found(model: BallModel, state: Tensor, height: Tensor | float, longest: Ten
         calm = model.in_flight
         functions = motion.functions_of(calm)
         if functions is not None:
-            return motion.contact_time(calm, functions, state, height, longest)
+            return by_machine_code.contact_time(calm, functions, state, height, longest)
     tau = _search(model, state, height, torch.zeros_like(state[..., Z]), longest)
     if bool(tau.isnan().any()):  # rare: lift above the weight, near misses, or no contact at all
         start = _scan(model, state, height, tau.isnan(), longest)
@@ -131,7 +128,7 @@ def fly_through(
     if not followed(state, dt, *heights):
         functions = motion.functions_of(model)
         if functions is not None:
-            return motion.fly_through(model, functions, state, dt, heights)
+            return by_machine_code.fly_through(model, functions, state, dt, heights)
     elapsed = torch.zeros_like(dt)
     lost = torch.zeros_like(dt, dtype=torch.bool)
     times = []
@@ -159,7 +156,7 @@ def fly_through_jacobian(
     if is_plain(state):
         functions = motion.functions_of(model)
         if functions is not None:
-            return motion.fly_through_jacobian(model, functions, state, dt, heights)
+            return by_machine_code.fly_through_jacobian(model, functions, state, dt, heights)
     state = state.detach()
     jacobian = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device).expand(*state.shape, -1)
     elapsed = torch.zeros_like(dt)
@@ -196,78 +193,13 @@ def _flow_rate(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
 def gap_jacobian(model: BallModel, state: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
     """Gaps (n,) m between balls in states (n, 9) and surfaces at heights in m or (n,), and their derivatives (n, 9)."""
     if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        found = motion.Moving(model, functions, state, state.shape[-1]).gaps(_numbers(height))
+        found = motion.Moving(model, functions, state.detach().numpy(), state.shape[-1]).gaps(_numbers(height))
         return torch.from_numpy(found[0]), torch.from_numpy(found[1])
     leaf = state.detach().requires_grad_(True)
     with torch.enable_grad():
         gap = model.gap(leaf, height)
         (gradient,) = torch.autograd.grad(gap.sum(), leaf)
     return gap.detach(), gradient
-
-
-def acceleration(model: BallModel, state: Tensor) -> Tensor:
-    """(n, 3) m/s^2 of balls in flight, in states (n, 9), without derivatives."""
-    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        return torch.from_numpy(motion.Moving(model, functions, state, 0).rates()[:, :3])
-    with torch.no_grad():
-        return model.rates(state)[0]
-
-
-def gaps(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
-    """`model.gap` of states (n, 9), without derivatives."""
-    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        return torch.from_numpy(motion.Moving(model, functions, state, 0).gaps(_numbers(height))[0])
-    with torch.no_grad():
-        return model.gap(state, height)
-
-
-def bounced(model: BallModel, state: Tensor) -> Tensor:
-    """`model.after_bounce` of states (n, 9), without derivatives."""
-    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        return torch.from_numpy(motion.Moving(model, functions, state, 0).after_bounce())
-    with torch.no_grad():
-        return model.after_bounce(state)
-
-
-class PreparedMotion:
-    """The motion of balls in states (n, w), with what machine code needs looked up once; by torch where it has none.
-
-    Args: model: the ball, with the coefficients that it has now.  width: w, 9 + p with those that travel.
-    """
-
-    def __init__(self, model: BallModel, width: int) -> None:
-        functions = motion.functions_of(model)
-        self.model = model
-        self._moving = None if functions is None else motion.Moving(model, functions, np.empty((0, width)), width)
-
-    def fly(self, start: Array, dt: float) -> tuple[Array, Array]:
-        """States (n, w) after dt s of free flight, and their Jacobians (n, w, w)."""
-        start, durations = plain(start), np.full(len(start), dt)
-        if self._moving is None:
-            flown, jacobian = fly_jacobian(self.model, torch.from_numpy(start), torch.from_numpy(durations))
-            return flown.numpy(), jacobian.numpy()
-        after, moved, _ = self._moving.at(start).travel(durations, np.empty((len(start), 0)))
-        return after, moved
-
-    def bounce(self, start: Array, dt: float, height: float) -> tuple[Array, Array, Array]:
-        """States (n, w) after dt s with a contact with a surface (m) on the way, its times (n,) s, and the Jacobians.
-
-        NaN for a ball that never comes down to it.
-        """
-        start, durations = plain(start), np.full(len(start), dt)
-        if self._moving is None:
-            given = (torch.from_numpy(start), torch.from_numpy(durations), (height,))
-            after, times, jacobian = (found.numpy() for found in fly_through_jacobian(self.model, *given))
-            return after, times[:, 0], jacobian
-        after, moved, times = self._moving.at(start).travel(durations, np.full((len(start), 1), height))
-        return after, times[:, 0], moved
-
-    def gaps(self, states: Array, height: float) -> tuple[Array, Array]:
-        """(n,) m from a surface (m) up to balls' lowest points, and the derivatives (n, w)."""
-        if self._moving is None:
-            gaps, slopes = gap_jacobian(self.model, torch.from_numpy(plain(states)), height)
-            return gaps.numpy(), slopes.numpy()
-        return self._moving.at(plain(states)).gaps(height)
 
 
 def _numbers(height: Tensor | float) -> Array | float:

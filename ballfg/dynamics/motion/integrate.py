@@ -8,6 +8,7 @@ from torch.autograd import forward_ad
 
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion import by_machine_code
 from ballfg.dynamics.motion.flight_step import rk4_step, step_jacobian
 from ballfg.dynamics.motion.limits import step_count
 
@@ -22,7 +23,7 @@ def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
         calm = model.in_flight
         functions = motion.functions_of(calm)
         if functions is not None:
-            return motion.fly(calm, functions, state, dt)
+            return by_machine_code.fly(calm, functions, state, dt)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
     for _ in range(steps):
@@ -54,7 +55,7 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
     if is_plain(state):
         functions = motion.functions_of(model)
         if functions is not None:
-            return motion.fly_jacobian(model, functions, state, dt)
+            return by_machine_code.fly_jacobian(model, functions, state, dt)
     state = state.detach()
     steps = step_count(dt)
     h = (dt.detach() / steps).unsqueeze(-1)

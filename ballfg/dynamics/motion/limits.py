@@ -1,13 +1,15 @@
 """Defines the limits of integrations and contact searches, for torch and machine code alike."""
 
 import math
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numba.extending import register_jitable
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 STAGES: Final = ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0))
 """Of the classic Runge-Kutta scheme of order four, for the second stage to the last: how far along the step it lies, by
@@ -59,14 +61,14 @@ def steps_over_each(durations: Array) -> Index:
     return np.maximum(1, np.ceil(durations / MAX_STEP - 1e-9)).astype(np.int64)
 
 
-def step_count(dt: Tensor | Array) -> int:
+def step_count(dt: "Tensor | Array") -> int:
     """Number of equal steps, each at most `MAX_STEP`, that the longest of some intervals (s) needs.
 
     An interval that is NaN (a contact that never comes) needs none.
 
     Raises: ValueError: if an interval is infinite.
     """
-    durations = dt.detach().abs() if isinstance(dt, Tensor) else np.abs(dt)
+    durations = np.abs(dt) if isinstance(dt, np.ndarray) else dt.detach().abs()
     longest = float(durations.max()) if 0 not in durations.shape else 0.0
     if math.isnan(longest):
         longest = max((float(d) for d in durations.reshape(-1) if not math.isnan(d)), default=0.0)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel, take_rows
+from ballfg.dynamics.motion import by_machine_code
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.flight_step import rk4_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly, followed, is_plain
@@ -54,7 +55,7 @@ def place_on(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
 def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
     """The state after `dt` (...) s on the surface at `height` m: sliding until it rolls, then rolling."""
     if not followed(state, dt, height) and (functions := motion.functions_of(model)) is not None:
-        return motion.roll(model, functions, state, dt, height)
+        return by_machine_code.roll(model, functions, state, dt, height)
     state = place_on(model, state, height)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
@@ -66,7 +67,7 @@ def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) ->
 def roll_jacobian(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
     """`roll` of states (n, 9) over dt (n,) s, and its derivative (n, 9, 9) by the state; both detached."""
     if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        return motion.roll_jacobian(model, functions, state, dt, height)
+        return by_machine_code.roll_jacobian(model, functions, state, dt, height)
     return batch_jacobian(lambda at: roll(model, at, dt, height), state)
 
 
@@ -228,4 +229,4 @@ def _by_machine_code(model: BallModel, state: Tensor, steps: Tensor, surfaces: S
     if not steps.numel() or followed(state, steps):
         return None
     functions = motion.functions_of(model)
-    return None if functions is None else motion.roll_out(model, functions, state, steps, surfaces)
+    return None if functions is None else by_machine_code.roll_out(model, functions, state, steps, surfaces)

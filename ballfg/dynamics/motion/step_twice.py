@@ -130,7 +130,7 @@ def _step(model: BallModel, state: Tensor, h: Tensor) -> tuple[Tensor, Tensor, T
         with torch.no_grad():
             after, stages = runge_kutta(lambda _, x: derivative(model.rates, x), state, h)
         return after, torch.stack(stages), rate_jacobians(model, torch.stack(stages))
-    moving, jacobians = motion.Moving(model, functions, state, state.shape[-1]), []
+    moving, jacobians = motion.Moving(model, functions, state.detach().numpy(), state.shape[-1]), []
 
     def slope(_: int, x: Tensor) -> Tensor:
         slopes, by_state = moving.slopes(x.numpy())

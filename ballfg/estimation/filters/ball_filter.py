@@ -1,13 +1,12 @@
 """Extends filterpy's extended Kalman filter by the ball's own prediction."""
 
 import numpy as np
-import torch
 from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from scipy.special import chdtri
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import Advance, advance_jacobian
+from ballfg.dynamics.motion.arrays import Advance, advance_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.factors.batch import FactorBatch
@@ -43,16 +42,16 @@ class BallFilter(FilterpyEKF):
     def move(self, point: Array, dt: float, decay: float) -> Advance:
         """Sets F at the linearisation point, and the mean that `predict_x` will put into x."""
         width = self.width
-        motion = advance_jacobian(self.model, torch.from_numpy(point[:width])[None], dt, self.surfaces)
+        motion = advance_jacobian(self.model, point[:width], dt, self.surfaces)
         self.F = np.diag(np.full(len(point), decay))
-        self.F[:width, :width] = motion.jacobian.numpy()
+        self.F[:width, :width] = motion.jacobian
         self.predicted = decay * self.x
-        self.predicted[:width] = motion.after[0].numpy() + self.F[:width, :width] @ (self.x - point)[:width]
+        self.predicted[:width] = motion.after + self.F[:width, :width] @ (self.x - point)[:width]
         return motion
 
     def time_to_contact(self, within: float) -> float:
         """The time until the next contact of the mean, s; infinite if there is none within so many s."""
-        motion = advance_jacobian(self.model, torch.from_numpy(self.x[: self.width])[None], within, self.surfaces)
+        motion = advance_jacobian(self.model, self.x[: self.width], within, self.surfaces)
         return min((time for time, _ in motion.contacts), default=np.inf)
 
     @property

@@ -14,7 +14,7 @@ from scipy.linalg import LinAlgWarning
 from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_flag
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import Advance
+from ballfg.dynamics.motion.arrays import Advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth

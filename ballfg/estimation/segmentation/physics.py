@@ -4,14 +4,14 @@ import math
 import weakref
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel, is_substituted
+from ballfg.dynamics.motion.arrays import acceleration, bounced, surface_offsets
 from ballfg.state import STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 
 PROBE_SPEEDS = (2.0, 4.0, 8.0)
@@ -96,48 +96,46 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
     return known[2]
 
 
-_known: weakref.WeakKeyDictionary[BallModel, tuple[Hashable, Sequence[Tensor], SegmentationPhysics]]
+_known: weakref.WeakKeyDictionary[BallModel, tuple[Hashable, Sequence[Any], SegmentationPhysics]]
 _known = weakref.WeakKeyDictionary()
 """For each model: the stamp of its numbers, its tables, and the result."""
 
 
 def _asked(model: BallModel) -> SegmentationPhysics:
-    still = torch.zeros(1, STATE_DIM, dtype=torch.float64)
+    still = np.zeros((1, STATE_DIM))
     still[:, Z] = 1.0
-    with torch.no_grad():
-        offset, *slope = _surface(model, still)
-        restitution, friction = _bounce_coefficients(model, still, slope)
-        gravity, drag = -float(model.rates(still)[0][0, 2]), _drag_coefficient(model, still)
+    offset, *slope = _surface(model, still)
+    restitution, friction = _bounce_coefficients(model, still, slope)
+    gravity, drag = -float(acceleration(model, still)[0, 2]), _drag_coefficient(model, still)
     values = dict(zip(BOUNDS, (gravity, drag, restitution, friction, model.radius, offset, *slope), strict=True))
     return SegmentationPhysics(**{n: v for n, v in values.items() if BOUNDS[n][0] <= v <= BOUNDS[n][1]})
 
 
-def _drag_coefficient(model: BallModel, still: Tensor) -> float:
+def _drag_coefficient(model: BallModel, still: Array) -> float:
     """1/m, least-squares k in a . v = -k |v|^3 over four directions and `PROBE_SPEEDS`."""
-    speeds = torch.tensor(PROBE_SPEEDS, dtype=torch.float64).repeat_interleave(4)
-    headings = torch.arange(len(speeds), dtype=torch.float64) * (math.pi / 2)
-    flying = still.repeat(len(speeds), 1)
-    flying[:, VELOCITY] = torch.stack((headings.cos() * speeds, headings.sin() * speeds, 0 * speeds), dim=-1)
-    pull = (model.rates(flying)[0] * flying[:, VELOCITY]).sum(-1)
-    return -float((pull * speeds**3).sum() / speeds.pow(6).sum())
+    speeds = np.repeat(PROBE_SPEEDS, 4)
+    headings = np.arange(len(speeds)) * (math.pi / 2)
+    flying = np.tile(still, (len(speeds), 1))
+    flying[:, VELOCITY] = np.stack((np.cos(headings) * speeds, np.sin(headings) * speeds, 0 * speeds), axis=-1)
+    pull = (acceleration(model, flying) * flying[:, VELOCITY]).sum(axis=-1)
+    return -float((pull * speeds**3).sum() / (speeds**6).sum())
 
 
-def _surface(model: BallModel, still: Tensor) -> list[float]:
+def _surface(model: BallModel, still: Array) -> list[float]:
     """m, the offset of surfaces at the origin, and by how much it grows over 1 m along x and along y."""
-    places = still.repeat(3, 1)
+    places = np.tile(still, (3, 1))
     places[1, 0] = places[2, 1] = 1.0
-    here, *there = torch.as_tensor(model.surface_offset(places)).expand(3).tolist()
+    here, *there = surface_offsets(model, places).tolist()
     return [here, *(offset - here for offset in there)]
 
 
-def _bounce_coefficients(model: BallModel, still: Tensor, slope: Sequence[float]) -> tuple[float, float]:
+def _bounce_coefficients(model: BallModel, still: Array, slope: Sequence[float]) -> tuple[float, float]:
     """Restitution and friction: normal and tangential impulse of fast sliding bounces at `PROBE_FALLS`."""
-    falls = torch.tensor(PROBE_FALLS, dtype=torch.float64)
-    normal = torch.tensor([-slope[0], -slope[1], 1.0], dtype=torch.float64)
-    along = torch.tensor([1.0, 0.0, slope[0]], dtype=torch.float64)
-    normal, along = normal / normal.norm(), along / along.norm()
-    falling = still.repeat(len(falls), 1)
+    falls = np.array(PROBE_FALLS)
+    normal, along = np.array([-slope[0], -slope[1], 1.0]), np.array([1.0, 0.0, slope[0]])
+    normal, along = normal / np.linalg.norm(normal), along / np.linalg.norm(along)
+    falling = np.tile(still, (len(falls), 1))
     falling[:, VELOCITY] = PROBE_SLIDE * along - falls[:, None] * normal
-    after = model.after_bounce(falling)[:, VELOCITY]
-    up, slid = (after * normal).sum(-1), PROBE_SLIDE - (after * along).sum(-1)
+    after = bounced(model, falling)[:, VELOCITY]
+    up, slid = (after * normal).sum(axis=-1), PROBE_SLIDE - (after * along).sum(axis=-1)
     return float((up / falls).mean()), float((slid / (up + falls)).mean())

@@ -12,15 +12,13 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.edges import height_below
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import PreparedMotion
-from ballfg.dynamics.motion.rollout import roll_jacobian
+from ballfg.dynamics.motion.arrays import PreparedMotion, roll_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.settings import Settings, stamp_covariance
@@ -147,10 +145,10 @@ class HypothesisModel:
 
     def predict_rest(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
         """Balls after dt s on the surface at a level (m), as if it had no ends."""
-        states, spans = torch.from_numpy(plain(balls.means[:, : self.width])), torch.full((len(balls),), dt).double()
-        after, jacobian = roll_jacobian(self.ball, states, spans, torch.full_like(spans, level))
+        spans, levels = np.full(len(balls), dt), np.full(len(balls), level)
+        after, jacobian = roll_jacobian(self.ball, balls.means[:, : self.width], spans, levels)
         noise = self.settings.process.flight(np.array([dt]))
-        return self._predicted(balls, after.numpy(), jacobian.numpy(), noise, dt)
+        return self._predicted(balls, after, jacobian, noise, dt)
 
     def predict_bounce(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
         """Balls after dt s with one bounce on the way, without those that never come down."""

@@ -7,11 +7,10 @@ from itertools import groupby
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import fly_through, gap_jacobian
+from ballfg.dynamics.motion.arrays import fly, fly_through, gap_jacobian
 from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact
@@ -158,9 +157,8 @@ def across_hits(
     """
     spans = times[hits + 1] - times[hits]
     starts = _with_coefficients(states[np.stack((hits + 1, hits), axis=1).ravel()], coefficients)
-    with torch.no_grad():
-        flown, _ = fly_through(model, starts, torch.from_numpy(np.stack((-spans, spans), axis=1).ravel()), ())
-    there = flown[:, :STATE_DIM].numpy().reshape(-1, 2, STATE_DIM)
+    flown = fly(model, starts, np.stack((-spans, spans), axis=1).ravel())
+    there = flown[:, :STATE_DIM].reshape(-1, 2, STATE_DIM)
     apart = there[:, 0] - states[hits]
     jump = apart[:, VELOCITY]
     lags = -(apart[:, POSITION] * jump).sum(axis=1) / np.maximum((jump**2).sum(axis=1), LEAST_SPEED**2)
@@ -178,8 +176,8 @@ def gap_sigmas(
 ) -> Array:
     """(m,) m, standard deviations of the gaps between balls and surfaces, `lags` s of flight after their stamps."""
     whole = _with_coefficients(states, shared.mean)
-    _, slopes = gap_jacobian(model, whole, torch.tensor(heights, dtype=torch.float64))
-    own, rest = slopes.numpy()[:, :STATE_DIM], slopes.numpy()[:, STATE_DIM:]
+    _, slopes = gap_jacobian(model, whole, np.array(heights))
+    own, rest = slopes[:, :STATE_DIM], slopes[:, STATE_DIM:]
     own[:, VZ] += lags
     variance = (own[:, None] @ covariances @ own[:, :, None])[:, 0, 0]
     if len(shared.mean):
@@ -201,15 +199,14 @@ def _on_other_side(
         start, dt = first + 1, times[first] - times[first + 1]
     passed = heights[:1] if start == stamp else heights[:-1]
     state = _with_coefficients(states[start : start + 1], coefficients)
-    with torch.no_grad():
-        after, _ = fly_through(model, state, torch.tensor([dt]), tuple(passed))
-    return after[0, :STATE_DIM].numpy()
+    after, _ = fly_through(model, state, np.array([dt]), passed)
+    return after[0, :STATE_DIM]
 
 
-def _with_coefficients(states: Array, coefficients: Array) -> torch.Tensor:
+def _with_coefficients(states: Array, coefficients: Array) -> Array:
     if not len(coefficients):
-        return torch.from_numpy(states)
-    return torch.from_numpy(np.column_stack((states, np.tile(coefficients, (len(states), 1)))))
+        return states
+    return np.column_stack((states, np.tile(coefficients, (len(states), 1))))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.augmented import AugmentedModel, augmented
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
@@ -58,12 +59,12 @@ class Events:
 
 def trackwise_model(model: BallModel, settings: Settings) -> BallModel:
     """The model, augmented by the coefficients that are estimated with each track."""
-    return AugmentedModel(model, tuple(settings.coefficients)) if settings.coefficients else model
+    return augmented(model, tuple(settings.coefficients))
 
 
 def coefficient_means(model: BallModel, settings: Settings) -> Array:
     """(p,) the model's own values of the estimated coefficients."""
-    return np.array([float(model.get_parameter(name).detach()) for name in settings.coefficients])
+    return np.array([numbers_of(model).value(name) for name in settings.coefficients])
 
 
 def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:

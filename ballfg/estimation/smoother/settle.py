@@ -14,11 +14,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import bounced, fly_through, gaps
+from ballfg.dynamics.motion.arrays import bounced, fly_through, gaps, surface_offsets
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
@@ -113,13 +112,13 @@ def initial_states(
     if label is not None:
         states[:, SPIN] = label.spin
     for contact in sorted(contacts, key=lambda c: c.time):  # the state before it can reach it
-        before = torch.from_numpy(states[[contact.interval]])
-        states[contact.interval, Z] -= min(0.0, float(gaps(model, before, contact.height)))
+        before = states[[contact.interval]]
+        states[contact.interval, Z] -= min(0.0, float(gaps(model, before, contact.height)[0]))
         states[contact.interval, VZ] = before[0, VZ] = min(float(before[0, VZ]), -LEAST_FALL)
-        states[contact.interval + 1 :, SPIN] = bounced(model, before)[0, SPIN].numpy()
+        states[contact.interval + 1 :, SPIN] = bounced(model, before)[0, SPIN]
     for rest in segmentation.rests:  # rolling: saturated friction does not determine the direction of the spin
         down = states[rest.first : rest.last + 2]
-        down[:, Z] -= gaps(model, torch.from_numpy(down), rest.height).numpy()
+        down[:, Z] -= gaps(model, down, rest.height)
         down[:, VZ] = 0.0
         down[:, SPIN.start] = -down[:, VELOCITY.start + 1] / model.radius
         down[:, SPIN.start + 1] = down[:, VELOCITY.start] / model.radius
@@ -211,8 +210,8 @@ def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surface
         interval, speed = min(inside, beyond), float(values.states[beyond, VZ])
         if interval in taken or (beyond - inside) * speed >= 0.0:  # it does not move away from the other samples
             continue
-        pair = torch.from_numpy(np.concatenate((values.states[[inside, beyond]], coefficients), axis=1))
-        height = surfaces.level_below(pair, model.surface_offset(pair))[0]
+        pair = np.concatenate((values.states[[inside, beyond]], coefficients), axis=1)
+        height = surfaces.level_below(pair, surface_offsets(model, pair))[0]
         above, below = gaps(model, pair, float(height)).tolist()
         if above >= 0.0 > below and bool(surfaces.over_table(pair)[1]):
             time = times[beyond] - below / speed
@@ -246,15 +245,14 @@ def move_contacts(
         if interval - 1 in changed:
             continue  # the contact entered or left this interval; the state after both is right already
         heights = tuple(height for i, height in new if i == interval)
-        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None])
-        gap = float(gaps(model, start, heights[0])) if heights else 0.0
+        start = np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None]
+        gap = float(gaps(model, start, heights[0])[0]) if heights else 0.0
         if gap < 0.0 < states[interval, VZ]:  # it was on the way up, from below: before the contact it mirrors that
             states[interval, [Z, VZ]] -= (2.0 * gap, 2.0 * states[interval, VZ])
-            start[0, :STATE_DIM] = torch.from_numpy(states[interval])
-        with torch.no_grad():
-            after, _ = fly_through(model, start, torch.from_numpy(np.diff(times[interval : interval + 2])), heights)
-        if bool(after.isfinite().all()):
-            states[interval + 1] = after[0, :STATE_DIM].numpy()
+            start[0, :STATE_DIM] = states[interval]
+        after, _ = fly_through(model, start, np.diff(times[interval : interval + 2]), heights)
+        if np.isfinite(after).all():
+            states[interval + 1] = after[0, :STATE_DIM]
     return replace(values, states=states)
 
 

@@ -14,11 +14,12 @@ from ballfg.dynamics.compiled import functions
 from ballfg.dynamics.compiled.build import built
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.kept import cache_folder
-from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
+from ballfg.dynamics.compiled.motion import functions_of
 from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Coefficient, FlightEffect
 from ballfg.dynamics.effects.registry import GENERIC, LEARNED
 from ballfg.dynamics.model import substitute
+from ballfg.dynamics.motion.by_machine_code import fly_jacobian, fly_through_jacobian
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.estimation.segmentation.physics import physics_of

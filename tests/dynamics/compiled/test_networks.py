@@ -12,9 +12,10 @@ import torch
 from ballfg.dynamics import Architecture, build, nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.functions import compiled
-from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
+from ballfg.dynamics.compiled.motion import functions_of
 from ballfg.dynamics.compiled.translation.arrays import narrowest
 from ballfg.dynamics.compiled.translation.trace import trace
+from ballfg.dynamics.motion.by_machine_code import fly_jacobian, fly_through_jacobian
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.networks.fading import Fading

@@ -9,7 +9,7 @@ import torch
 from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import ROLLING_RESISTANCE, SOFT_SLIP, STANDARD_GRAVITY
-from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
+from ballfg.dynamics.motion.arrays import advance_jacobian
 from ballfg.dynamics.motion.integrate import batch_jacobian
 from ballfg.dynamics.motion.rollout import advance, roll, roll_jacobian
 from ballfg.factors.noise import ProcessNoise
@@ -51,9 +51,9 @@ def test_motions_that_end_on_a_surface_are_those_of_torch(ball: str, surfaces: S
 
         with torch.enable_grad():  # torch's own operations
             after, jacobian = batch_jacobian(moved, start)
-        got = advance_jacobian(model, start, dt.item(), surfaces)
-        close(got.after, after)
-        close(got.jacobian, jacobian[0])
+        got = advance_jacobian(model, start[0].numpy(), dt.item(), surfaces)
+        close(torch.from_numpy(got.after), after[0])
+        close(torch.from_numpy(got.jacobian), jacobian[0])
         with torch.no_grad():
             close(rollout(model, start, dt[None], surfaces)[:, 0], after)
 
@@ -77,16 +77,16 @@ def way(speed: float) -> float:
 
 def test_a_rolling_ball_goes_as_far_as_its_energy_says(build) -> None:
     model, speed = build(gravity={}), 1.0
-    start = torch.tensor([[0, 0, R, speed, 0, 0, 0, speed / R, 0]], dtype=torch.float64)
+    start = np.array([0, 0, R, speed, 0, 0, 0, speed / R, 0])
     motion = advance_jacobian(model, start, 20.0, Surfaces(0.0))
-    x, v = motion.after[0, 0].item(), motion.after[0, 3].item()
+    x, v = motion.after[0], motion.after[3]
     assert x == pytest.approx(way(speed) - way(v), abs=1e-9)
     assert way(5.0) == pytest.approx(5.0**2 / (2 * ROLLING_RESISTANCE * STANDARD_GRAVITY), rel=0.01)
-    faster = motion.jacobian @ torch.tensor([0, 0, 0, 1, 0, 0, 0, 1 / R, 0], dtype=torch.float64)
+    faster = motion.jacobian @ np.array([0, 0, 0, 1, 0, 0, 0, 1 / R, 0])
     first, last = (s / np.hypot(s, SOFT_SLIP) for s in (speed, v))  # deceleration over a
-    assert faster[3].item() == pytest.approx(last / first, rel=1e-8)  # v dv / dx: time is lost at the same rate
+    assert faster[3] == pytest.approx(last / first, rel=1e-8)  # v dv / dx: time is lost at the same rate
     a = ROLLING_RESISTANCE * STANDARD_GRAVITY
-    assert faster[0].item() == pytest.approx((speed - v) / (a * first), rel=1e-8)
+    assert faster[0] == pytest.approx((speed - v) / (a * first), rel=1e-8)
 
 
 def test_a_forecast_rolls_to_its_stop_and_crosses_on_the_way(build) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ballfg.dynamics import nominal_model
-from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
+from ballfg.dynamics.motion.arrays import advance_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.result import Estimate
@@ -38,12 +38,12 @@ def simulate(model, settings: Settings, start, times, rng, surfaces=TABLE, label
     truth = [np.array(start)]
     noise = settings.process
     for dt in np.diff(times):
-        motion = advance_jacobian(model, tensor(truth[-1]), dt, surfaces)
+        motion = advance_jacobian(model, truth[-1], dt, surfaces)
         covariance = noise.flight(np.array([dt]))[0]
         for time, _ in motion.contacts:
             kick = noise.contact(np.array([dt]), np.array([time]))[0]
             covariance = covariance + kick
-        truth.append(motion.after[0].numpy() + rng.multivariate_normal(np.zeros(9), covariance, method="eigh"))
+        truth.append(motion.after + rng.multivariate_normal(np.zeros(9), covariance, method="eigh"))
     truth = np.array(truth)
     measured = truth[:, POSITION] + settings.position_noise * rng.standard_normal((len(times), 3))
     spin = truth[0, 6:] + settings.spin_label_noise * rng.standard_normal(3)

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effects.flight import Gravity
-from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
+from ballfg.dynamics.motion.arrays import advance_jacobian
 from ballfg.estimation.filters.ball_filter import BallFilter
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter, _Run
 from ballfg.estimation.result import Status
@@ -20,7 +20,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import Track
-from tests.estimation.filters.filtering import LOW, PLAIN, SERVE, TABLE, run, simulate, tensor, with_positions
+from tests.estimation.filters.filtering import LOW, PLAIN, SERVE, TABLE, run, simulate, with_positions
 from tests.estimation.nees import nees
 
 
@@ -174,7 +174,7 @@ def test_stamps_a_microsecond_apart(rng):
 def test_a_contact_close_to_a_stamp(shift, rng):
     """The bounce falls within 1.5 ms of a stamp, on either side; innovations must not notice."""
     exact = Settings(process=ProcessNoise(1e-3, 1e-3, 1e-3, 1e-3), position_noise=(0.002,) * 3)
-    contact = advance_jacobian(nominal_model(), tensor(SERVE), 0.6, TABLE).contacts[0][0]
+    contact = advance_jacobian(nominal_model(), np.array(SERVE, dtype=float), 0.6, TABLE).contacts[0][0]
     times = np.concatenate(([0.0], contact + shift + np.arange(-30, 20) * 0.01))
     _, track = simulate(nominal_model(), exact, SERVE, times, rng)
     result = run(track)

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal, norm
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled import motion
-from ballfg.dynamics.motion.contact import PreparedMotion
+from ballfg.dynamics.motion.arrays import PreparedMotion
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.sides.gaussians import GaussianMixture

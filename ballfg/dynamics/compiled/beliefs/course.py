@@ -5,14 +5,12 @@ from dataclasses import dataclass, fields
 from typing import Any, Final, Self
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.beliefs.carry import carry
 from ballfg.dynamics.compiled.beliefs.events import find
 from ballfg.dynamics.compiled.beliefs.mixture import mix
-from ballfg.dynamics.compiled.in_torch import functions_for, raise_errors
-from ballfg.dynamics.compiled.motion import Moving, world_of
+from ballfg.dynamics.compiled.motion import Moving, functions_for, raise_errors, world_of
 from ballfg.dynamics.compiled.roll_out import crossed_by_all, scatter
 from ballfg.dynamics.compiled.signatures import GIVEN
 from ballfg.dynamics.model import BallModel
@@ -72,7 +70,7 @@ class Carrier:
 
     def __init__(self, model: BallModel, mean: Array, surfaces: Surfaces, noise: Array) -> None:
         functions = functions_for(model)
-        moving = Moving(model, functions, torch.from_numpy(mean), mean.shape[1])
+        moving = Moving(model, functions, mean, mean.shape[1])
         self._laws = moving.laws
         self._given = self._laws[: len(GIVEN)]
         self._functions = functions
@@ -161,7 +159,7 @@ class Scattered:
         functions, (n, steps) = functions_for(model), pushes.shape[:2]
         worlds = np.tile(world_of(surfaces, functions.radius), (n, 1))
         worlds[:, ENDS] += ends
-        moving = Moving(model, functions, torch.from_numpy(start), 0)
+        moving = Moving(model, functions, start, 0)
         states, times, met = np.empty((n, steps, 3, STATE_DIM)), np.empty((n, steps, 3)), np.empty((n, steps, 3))
         first = np.ascontiguousarray(start[:, :STATE_DIM])
         scatter(*moving.laws, first, h, np.ascontiguousarray(pushes), kicks, worlds, states, times, met)

@@ -9,12 +9,11 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import bounced, gap_jacobian
+from ballfg.dynamics.motion.arrays import bounced, gap_jacobian, surface_offsets
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Quality, Rest
 from ballfg.estimation.segmentation.segmenter import USUAL
@@ -258,32 +257,32 @@ def _before_contact_at_start(
     if speed <= 0.0 or above - problem.ball.radius > speed * step + UNEVEN:
         return None
     own = np.tile(values.coefficients[: problem.width], (2, 1))
-    start, later = torch.from_numpy(np.concatenate((values.states[:2], own), axis=1)).split(1)
-    height = smoother.surfaces.level_below(later, problem.ball.surface_offset(later))  # the first may seem below it
+    start, later = np.split(np.concatenate((values.states[:2], own), axis=1), 2)
+    height = smoother.surfaces.level_below(later, surface_offsets(problem.ball, later))  # the first may seem below it
     if not bool(smoother.surfaces.over_table(start)):
         return None
     found, slope = gap_jacobian(problem.ball, start, height)
-    gap = float(found)
-    if not gap < speed * step or gap > SIGMAS * _sigma_at_start(smoother, problem, solution, slope[0].numpy()):
+    gap = float(found[0])
+    if not gap < speed * step or gap > SIGMAS * _sigma_at_start(smoother, problem, solution, slope[0]):
         return None
     states, label = values.states.copy(), problem.settings.spin_label(problem.track)
     states[0, SPIN] = 0.0 if label is None else label.spin
     states[0, VELOCITY] = _velocity_before(problem.ball, values.coefficients[: problem.width], states[0])
     states[0, Z] -= 2.0 * gap if gap < 0.0 else max(gap - 0.5 * speed * step, 0.0)
-    contact = Contact(0, float(times[0]) + min(abs(gap) / speed, step), float(height))
+    contact = Contact(0, float(times[0]) + min(abs(gap) / speed, step), float(height[0]))
     return contact, replace(values, states=states)
 
 
 def _velocity_before(ball: BallModel, coefficients: Array, after: Array) -> Array:
     """(3,) m/s, from which a bounce of the spin of `after` (9,) makes its velocity, found by repetition."""
-    before = torch.from_numpy(np.concatenate((after, coefficients))[None])
-    target = before[0, VELOCITY].clone()
+    before = np.concatenate((after, coefficients))[None]
+    target = before[0, VELOCITY].copy()
     before[0, VZ] *= -1.0
     for _ in range(ROUNDS):
         missing = target - bounced(ball, before)[0, VELOCITY]
-        before[0, VELOCITY] += missing * torch.tensor([1.0, 1.0, -1.0], dtype=missing.dtype)
+        before[0, VELOCITY] += missing * np.array([1.0, 1.0, -1.0])
         before[0, VZ] = min(float(before[0, VZ]), -LEAST_FALL)
-    return before[0, VELOCITY].numpy()
+    return before[0, VELOCITY]
 
 
 def _sigma_at_start(smoother: "Smoother", problem: TrackProblem, solution: Solution, slope: Array) -> float:

@@ -15,10 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
-from ballfg.dynamics.motion.contact import gaps
+from ballfg.dynamics.motion.arrays import gaps
 from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.sides.monitor import FAR
@@ -273,11 +272,11 @@ class _Search:
 
     def log_chance(self, states: Array, known: Covariances) -> float:
         """nats, of a path that meets no surface at its samples: at the lowest of them."""
-        surfaces, whole = self.smoother.surfaces, torch.from_numpy(states)
-        over, sigmas = surfaces.over_table(whole).numpy(), np.sqrt(known.states[:, 2, 2])
+        surfaces = self.smoother.surfaces
+        over, sigmas = surfaces.over_table(states), np.sqrt(known.states[:, 2, 2])
         chance = 1.0
         for there, height in ((over, surfaces.table_height), (~over, surfaces.lowest())):
             if there.any() and height > -math.inf:
-                above = gaps(self.smoother.model, whole[there], height).numpy() / sigmas[there]
+                above = gaps(self.smoother.model, states[there], height) / sigmas[there]
                 chance = min(chance, 0.5 * math.erfc(-float(above.min()) / math.sqrt(2.0)))
         return math.log(max(chance, 1e-300))

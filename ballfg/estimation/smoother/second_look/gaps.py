@@ -11,10 +11,9 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
-from ballfg.dynamics.motion.contact import fly_through
+from ballfg.dynamics.motion.arrays import fly_through
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.explain import hit_price
@@ -204,7 +203,7 @@ def _heights_below(surfaces: Surfaces, track: Track, gap: int, parts: Array) -> 
     """m, heights of the surfaces below the line between the ends of a gap, at parts (k,) of its length."""
     places = track.positions[gap] + parts[:, None] * (track.positions[gap + 1] - track.positions[gap])
     places[:, Z] = track.positions[gap : gap + 2, Z].max()
-    heights: list[float] = surfaces.height_below(torch.from_numpy(places), 0.0).tolist()
+    heights: list[float] = surfaces.height_below(places, 0.0).tolist()
     return heights
 
 
@@ -255,8 +254,7 @@ def _foretold(smoother: Smoother, problem: TrackProblem, solution: Solution, gap
     start = np.concatenate((values.states[gap], values.coefficients[: problem.width]))
     heights = _heights_below(smoother.surfaces, track, gap, np.zeros(MOST))
     dt = track.times[gap + 1] - track.times[gap]
-    with torch.no_grad():
-        _, times = fly_through(problem.ball, torch.from_numpy(start[None]), torch.tensor([dt]), tuple(heights))
+    _, times = fly_through(problem.ball, start[None], np.array([dt]), heights)
     return int((times < dt).sum())
 
 

@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ballfg.arrays import Array, median
-from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.augmented import augmented
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import acceleration, gaps
+from ballfg.dynamics.motion.arrays import acceleration, bounced, gaps
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
@@ -112,7 +111,7 @@ def low_hops(
         gap = ball.gap(track.positions, height)
         low = np.abs(gap) < most
         if number == 0:
-            low &= surfaces.over_table(torch.from_numpy(track.positions)).numpy()
+            low &= surfaces.over_table(track.positions)
         for first, last in _runs(low, events, unseen):
             if first == last:
                 continue
@@ -178,8 +177,7 @@ def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
     states = estimate.states[hops.first : hops.last + 1]
     before = states.copy()
     before[:, VZ] = -np.maximum(hops.known.speed, REST_SPEED)
-    with torch.no_grad():
-        jumps = model.after_bounce(torch.from_numpy(before)).numpy() - before
+    jumps = bounced(model, before) - before
     at = np.array([c.interval for c in estimate.contacts if hops.first <= c.interval < hops.last], dtype=np.int64)
     if len(at):
         counted = estimate.states[at + 1] - estimate.states[at]
@@ -205,17 +203,17 @@ class _Ball:
 
     def __init__(self, model: BallModel, settings: Settings) -> None:
         names = tuple(settings.coefficients)
-        self.model = AugmentedModel(model, names) if names else model
-        self.means = self.model.means().detach().numpy() if isinstance(self.model, AugmentedModel) else np.zeros(0)
+        self.model = augmented(model, names)
+        self.means = np.array([numbers_of(model).value(name) for name in names])
         self.sigmas, self.process = np.array(list(settings.coefficients.values())), settings.process
 
     def gap(self, positions: Array, height: float) -> Array:
         """(n,) m, from the surface up to the ball, at positions (n, 3) m."""
-        return np.asarray(gaps(self.model, self._still(positions, self.means), height).numpy())
+        return gaps(self.model, self._still(positions, self.means), height)
 
     def level_sigma(self, position: Array, height: float) -> float:
         """m, standard deviation of the surface's height. Args: position: (3,) m.  height: m, as declared."""
-        varied = gaps(self.model, self._varied(position), height).numpy()
+        varied = gaps(self.model, self._varied(position), height)
         return float(np.linalg.norm(varied[1:] - varied[0]))
 
     def gravity(self, position: Array) -> float:
@@ -225,31 +223,30 @@ class _Ball:
     def law(self, position: Array, most: float, gravity: float) -> HopLaw:
         """Parameters of hops up to a height `most` m above a surface, at a position (3,) m."""
         varied = self._varied(position)
-        with torch.no_grad():
-            fall = float(np.sqrt(2.0 * gravity * most))
-            known = self._rebound(varied[:1], torch.tensor([max(fall, 2.0 * REST_SPEED)], dtype=torch.float64))[0, 0]
-            speeds = HopLaw.speeds(max(fall * fall / max(float(known), 0.5 * fall), 2.0 * REST_SPEED))
-            rebound = self._rebound(varied, torch.from_numpy(speeds)).numpy()
+        fall = float(np.sqrt(2.0 * gravity * most))
+        known = self._rebound(varied[:1], np.array([max(fall, 2.0 * REST_SPEED)]))[0, 0]
+        speeds = HopLaw.speeds(max(fall * fall / max(float(known), 0.5 * fall), 2.0 * REST_SPEED))
+        rebound = self._rebound(varied, speeds)
         scatter = np.sqrt(self.process.contact_velocity**2 + ((rebound[1:] - rebound[0]) ** 2).sum(axis=0))
         slower = np.clip(rebound[0], 0.0, speeds)
         return HopLaw(gravity, float(speeds[-1]), slower, scatter, self.process.acceleration)
 
-    def _rebound(self, states: Tensor, speeds: Tensor) -> Tensor:
+    def _rebound(self, states: Array, speeds: Array) -> Array:
         """(m, k) m/s, vertical speeds after impacts with each of k speeds, for balls in m states."""
-        falling = states[:, None].repeat(1, len(speeds), 1)
+        falling = np.repeat(states[:, None], len(speeds), axis=1)
         falling[..., VZ] = -speeds
-        return self.model.after_bounce(falling.reshape(-1, falling.shape[-1]))[:, VZ].reshape(len(states), -1)
+        return bounced(self.model, falling.reshape(-1, falling.shape[-1]))[:, VZ].reshape(len(states), -1)
 
-    def _varied(self, position: Array) -> Tensor:
+    def _varied(self, position: Array) -> Array:
         """(1 + p, 9 + p) a ball that hangs still: as is, then with each coefficient raised by its sigma."""
         rows = np.concatenate((np.zeros((1, len(self.means))), np.diag(self.sigmas)))
         return self._still(np.tile(position, (len(rows), 1)), self.means + rows)
 
     @staticmethod
-    def _still(positions: Array, coefficients: Array) -> Tensor:
+    def _still(positions: Array, coefficients: Array) -> Array:
         states = np.zeros((len(positions), STATE_DIM + coefficients.shape[-1]))
         states[:, POSITION], states[:, STATE_DIM:] = positions, coefficients
-        return torch.from_numpy(states)
+        return states
 
 
 def _height_sigmas(track: Track, settings: Settings) -> Array:

@@ -12,11 +12,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.impact import slip_velocity
+from ballfg.dynamics.motion.arrays import bounced
 from ballfg.estimation.smoother.settle import Solution
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.dynamics import model_width
@@ -199,8 +198,8 @@ def _slopes(before: Array, slip: Array, model: BallModel) -> Array:
 
 def _slip(state: Array, radius: float) -> Array:
     """(.., 2) m/s, velocity of the ball's lowest point over a level surface, of states (.., 9) or longer."""
-    velocity, spin = torch.from_numpy(state[..., VELOCITY]), torch.from_numpy(state[..., SPIN])
-    return np.asarray(slip_velocity(velocity, spin, radius).numpy())
+    across = np.stack((-state[..., SPIN.start + 1], state[..., SPIN.start]), axis=-1)
+    return np.asarray(state[..., VELOCITY][..., :2] + radius * across)
 
 
 def _with_slip(before: Array, slip: Array, scale: Array, radius: float) -> Array:
@@ -213,5 +212,4 @@ def _with_slip(before: Array, slip: Array, scale: Array, radius: float) -> Array
 
 
 def _bounced(rows: Array, model: BallModel) -> Array:
-    with torch.no_grad():
-        return np.asarray(model.after_bounce(torch.from_numpy(rows)).numpy()[..., :STATE_DIM])
+    return bounced(model, rows.reshape(-1, rows.shape[-1]))[:, :STATE_DIM].reshape(*rows.shape[:-1], STATE_DIM)

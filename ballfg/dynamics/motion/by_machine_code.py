@@ -1,0 +1,108 @@
+"""Answers torch's motions, where no derivatives are asked, by machine code."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.arrays import Array
+from ballfg.dynamics.compiled import motion
+from ballfg.dynamics.compiled.functions import CompiledModel
+from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.state import STATE_DIM
+
+
+def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
+    """As `integrate.fly`, without derivatives."""
+    if state.dim() == 2 and dt.shape == state.shape[:1]:
+        return torch.from_numpy(motion.Moving(model, functions, _plain(state), 0).travel(_plain(dt), _levels(state))[0])
+    shape = np.broadcast_shapes(state.shape[:-1], dt.shape)  # torch's own imports sympy, which takes a second
+    rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
+    durations = _plain(dt.detach().expand(shape).reshape(-1))
+    after, _, _ = motion.Moving(model, functions, _plain(rows), 0).travel(durations, _levels(rows))
+    return torch.from_numpy(after).reshape(*shape, state.shape[-1])
+
+
+def contact_time(
+    model: BallModel, functions: CompiledModel, state: Tensor, height: Tensor | float, longest: Tensor | float
+) -> Tensor:
+    """As `contact.contact_time`, without derivatives."""
+    shape = state.shape[:-1]
+    moving = motion.Moving(model, functions, _plain(state.detach().reshape(-1, state.shape[-1])), 0)
+    return torch.from_numpy(moving.meets(*(_numbers(given, shape) for given in (height, longest)))).reshape(shape)
+
+
+def roll(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
+    """As `rollout.roll`, without derivatives."""
+    shape = np.broadcast_shapes(state.shape[:-1], dt.shape)
+    rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
+    durations, levels = (_numbers(given, torch.Size(shape)) for given in (dt, height))
+    after, _ = motion.Moving(model, functions, _plain(rows), 0).roll(durations, levels)
+    return torch.from_numpy(after).reshape(*shape, state.shape[-1])
+
+
+def roll_jacobian(
+    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, height: Tensor | float
+) -> tuple[Tensor, Tensor]:
+    """As `rollout.roll_jacobian`."""
+    moving = motion.Moving(model, functions, _plain(state), state.shape[-1])
+    after, jacobian = moving.roll(_plain(dt), _numbers(height, dt.shape))
+    return torch.from_numpy(after), torch.from_numpy(jacobian)
+
+
+def roll_out(model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor:
+    """Durations (n, k) s one after another, as in `rollout.rollout`: states (n, k, 9)."""
+    n, width = state.shape
+    moving = motion.Moving(model, functions, _plain(state), 0)
+    states = np.empty((n, steps.shape[1], STATE_DIM))
+    durations, world = np.ascontiguousarray(steps.detach().numpy()), motion.world_of(surfaces, functions.radius)
+    roll_out_rows(*moving.laws, np.ascontiguousarray(moving.start[:, :STATE_DIM]), durations, world, states)
+    if width > STATE_DIM:
+        travelling = np.broadcast_to(moving.start[:, None, STATE_DIM:], (n, steps.shape[1], width - STATE_DIM))
+        states = np.concatenate((states, travelling), axis=2)
+    return torch.from_numpy(states)
+
+
+def _numbers(given: Tensor | float, shape: torch.Size) -> Array:
+    """(n,) from a scalar or from one number per ball."""
+    if isinstance(given, Tensor):
+        return np.ascontiguousarray(given.detach().expand(shape).reshape(-1).numpy(), dtype=np.float64)
+    return np.full(shape.numel(), given, dtype=np.float64)
+
+
+def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+    """As `integrate.fly_jacobian`."""
+    shape, width = state.shape, state.shape[-1]
+    rows, durations = (state, dt) if dt.dim() == 1 else (state.reshape(-1, width), dt.reshape(-1))
+    after, jacobian, _ = motion.Moving(model, functions, _plain(rows), width).travel(_plain(durations), _levels(rows))
+    return torch.from_numpy(after.reshape(shape)), torch.from_numpy(jacobian.reshape(*shape, width))
+
+
+def fly_through(
+    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
+) -> tuple[Tensor, Tensor]:
+    """As `contact.fly_through`, without derivatives."""
+    after, _, times = motion.Moving(model, functions, _plain(state), 0).travel(_plain(dt), _levels(state, heights))
+    return torch.from_numpy(after), torch.from_numpy(times)
+
+
+def fly_through_jacobian(
+    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `contact.fly_through_jacobian`."""
+    moving = motion.Moving(model, functions, _plain(state), state.shape[-1])
+    after, jacobian, times = moving.travel(_plain(dt), _levels(state, heights))
+    return torch.from_numpy(after), torch.from_numpy(times), torch.from_numpy(jacobian)
+
+
+def _plain(given: Tensor) -> Array:
+    """Numbers for machine code: contiguous, in double precision."""
+    return np.ascontiguousarray(given.detach().numpy(), dtype=np.float64)
+
+
+def _levels(state: Tensor, heights: Sequence[Tensor | float] = ()) -> Array:
+    """(n, k) m from k heights of surfaces, each in m or (n,), for n states."""
+    return motion.levels(len(state), [h.numpy() if isinstance(h, Tensor) else h for h in heights])
