@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict, Unpack, cast, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.checks import check_count, check_instance, check_path, shown, type_name
-from ballfg.dynamics import BallModel, Surfaces, load_model, nominal_model
-from ballfg.dynamics.nominal import inertia_factor
+from ballfg.checks import check_count, check_path, shown, type_name
+from ballfg.dynamics.compiled.kept_model import check_model, ready_file
+from ballfg.dynamics.nominal import inertia_factor, nominal_model, ready_nominal
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Estimate, Estimator, Settings
 from ballfg.estimation.registry import make_estimator
 from ballfg.machine import MOST_JOBS
@@ -22,6 +23,7 @@ from ballfg.tracks.info import TrackFolder
 if TYPE_CHECKING:
     from ballfg.diagnosis import Diagnosis
     from ballfg.diagnosis.budget import ErrorBudget
+    from ballfg.dynamics import BallModel
     from ballfg.estimation import ConformalScales, TrackGraph
     from ballfg.estimation.flights.dataset import InFlight
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
 Folder: TypeAlias = str | PathLike[str]
 Tracks: TypeAlias = "Dataset | SightedDataset"
-Model: TypeAlias = BallModel | Ball | Folder | None
+Model: TypeAlias = "BallModel | Ball | Folder | None"
 Conformal: TypeAlias = "Tracks | ConformalScales | Folder | None"
 OneTrack: TypeAlias = Track | NDArray[np.float64] | tuple[ArrayLike, ArrayLike]
 """A track; or an array (n, 4) of t (s), x, y, z (m); or times (n,) s and positions (n, 3) m."""
@@ -363,15 +365,19 @@ def estimator_for(
     return make_estimator(method, ball, surfaces, settings)
 
 
-def _model(model: Model, source: "Tracks | None") -> BallModel:
+def _model(model: Model, source: "Tracks | None") -> "BallModel":
     ball = TABLE_TENNIS if source is None else source.ball
     if model is None or isinstance(model, Ball):
-        return nominal_model(ball if model is None else model)
+        return (nominal_model if source else ready_nominal)(ball if model is None else model)
     if not isinstance(model, str | PathLike):
-        check_instance("model", model, BallModel, "Load one with load_model, or give its file.")
-        return model
+        check_model(model, "Load one with load_model, or give its file.")
+        return cast("BallModel", model)
     room = None if source is None else source.info.name
     radius = None if source is None else ball.radius  # a track by itself is of the ball that a network knows
+    if source is None:
+        return ready_file(Path(model), radius=radius, inertia_factor=inertia_factor(ball), room=room)
+    from ballfg.dynamics import load_model
+
     return load_model(Path(model), radius=radius, inertia_factor=inertia_factor(ball), room=room)
 
 

@@ -8,18 +8,22 @@ Learning through an estimate also needs the residuals as a torch function of all
 model's parameters, the noise.
 """
 
+from __future__ import annotations
+
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 import numpy as np
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.loss import Loss
 from ballfg.state import STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 COEFFICIENTS = -1
 """The variable number of the coefficients shared by all factors; states have their index."""
@@ -57,12 +61,12 @@ class Values:
             return np.concatenate((self.states[variables], self.biases[variables]), axis=1)
         return self.states[variables]
 
-    def select(self, begin: int, end: int) -> "Values":
+    def select(self, begin: int, end: int) -> Values:
         """The values of the states begin to end - 1, with the same coefficients."""
         biases = None if self.biases is None else self.biases[begin:end]
         return Values(self.states[begin:end], self.coefficients, biases)
 
-    def retract(self, states: Array, coefficients: Array) -> "Values":
+    def retract(self, states: Array, coefficients: Array) -> Values:
         """These values plus a step.
 
         Args: states: (n, 9 + b) m, m/s, rad/s, m.  coefficients: (p,) in their own units.

@@ -5,18 +5,22 @@ and the ball's displacement at velocity v during the stamp's error s. The biases
 state, so that the graph stays banded; b_{i+1} = a_i b_i + noise with a_i = exp(-dt_i / memory time).
 """
 
+from __future__ import annotations
+
 from collections.abc import Hashable
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
+from ballfg.deferred import torch
 from ballfg.factors.batch import DiagonalFactors, FactorBatch, Noise, check_measured
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import whitening_tensor
 from ballfg.state import POSITION, STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 BIAS_DIM = 3
 _BIAS = slice(STATE_DIM, STATE_DIM + BIAS_DIM)

@@ -4,30 +4,32 @@ Three classes share everything but the motion over the interval: free flight, fl
 a surface. A hit is a flight whose process noise contains the hit.
 """
 
+from __future__ import annotations
+
 import copy
 from abc import abstractmethod
 from collections.abc import Hashable
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
-import torch
 from numba import types
-from torch import Tensor
 
 from ballfg.arrays import Array, Index, plain
-from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.deferred import torch
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.kept_model import carried
 from ballfg.dynamics.compiled.signatures import THREE, TWO
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
-from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.dynamics.motion import arrays
 from ballfg.dynamics.motion.limits import step_count, steps_over
-from ballfg.dynamics.motion.rollout import roll, roll_jacobian
-from ballfg.dynamics.motion.step_twice import flight_step
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
 from ballfg.factors.noise import Kicks, ProcessNoise, along_all_axes, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.model import BallModel
 
 
 @machine_code(types.Tuple((TWO, THREE))(THREE, TWO, TWO, THREE))
@@ -54,7 +56,7 @@ def whiten(root: Array, target: Array, after: Array, moved: Array) -> tuple[Arra
 
 def model_width(model: BallModel) -> int:
     """Number of a model's coefficients that travel with the state: those of an `AugmentedModel`."""
-    return model.width if isinstance(model, AugmentedModel) else 0
+    return len(carried(model)[1])
 
 
 class DynamicsFactors(FactorBatch):
@@ -79,7 +81,7 @@ class DynamicsFactors(FactorBatch):
     ) -> None:
         states = np.asarray(states, dtype=np.int64)
         columns = [states, states + 1]
-        if isinstance(model, AugmentedModel):
+        if carried(model)[1]:
             columns.append(np.full_like(states, COEFFICIENTS))
         super().__init__(np.stack(columns, axis=-1), STATE_DIM)
         if not (dt > 0).all():
@@ -92,12 +94,8 @@ class DynamicsFactors(FactorBatch):
         kicks = kicks or Kicks.none(len(states))
         self.kick_times, self.hit = kicks.times, kicks.hit
 
-    @staticmethod
-    def _tensor(array: Array) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array))
-
     @abstractmethod
-    def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
+    def propagate(self, state: Array, rows: Index | slice) -> tuple[Array, Array]:
         """F and its Jacobian: (k, 9 + p) and (k, 9 + p, 9 + p) from augmented states (k, 9 + p).
 
         Args: state: (k, 9 + p).  rows: (k,) index of the factors, or a slice.
@@ -110,9 +108,8 @@ class DynamicsFactors(FactorBatch):
     @property
     def group(self) -> Hashable:
         """Further entries: the model (one for all `AugmentedModel`s of a base), the number of contacts."""
-        model = self.model
-        own = (id(model.model), model.names) if isinstance(model, AugmentedModel) else (id(model), ())
-        return (*super().group, *own, self.kick_times.shape[1])  # type: ignore[misc]
+        inner, names = carried(self.model)
+        return (*super().group, id(inner), names, self.kick_times.shape[1])  # type: ignore[misc]
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 9) whitened residuals in torch."""
@@ -150,8 +147,8 @@ class DynamicsFactors(FactorBatch):
         Args: start: (k, 9 + p) augmented states.  rows: (k,) index of the factors, or a slice.
         """
         if self._moving is None:
-            found = self.propagate(torch.from_numpy(start), rows)
-            return plain(found[0].cpu().numpy()), plain(found[1].cpu().numpy())
+            after, jacobian = self.propagate(start, rows)
+            return plain(after), plain(jacobian)
         after, jacobian, _ = self._moving.at(start).travel(plain(self.dt[rows]), self._levels(rows))
         return after, jacobian
 
@@ -183,12 +180,14 @@ class FlightFactors(DynamicsFactors):
         other.whitening[rows], other.hit[rows] = whitening(noise.flight(dt) + noise.hit(dt)), True
         return other
 
-    def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
+    def propagate(self, state: Array, rows: Index | slice) -> tuple[Array, Array]:
         """Flight over dt."""
-        return fly_jacobian(self.model, state, self._tensor(self.dt[rows]))
+        return arrays.fly_jacobian(self.model, state, self.dt[rows])
 
     def transition(self, state: Tensor) -> Tensor:
         """Flight over dt."""
+        from ballfg.dynamics.motion.step_twice import flight_step
+
         dt = torch.from_numpy(self.dt)
         steps = step_count(dt)
         h = (dt / steps).unsqueeze(-1)
@@ -226,23 +225,21 @@ class ContactFactors(SurfaceFactors):
     Args: heights: (m, c) m, the surface of each of c contacts, in order.
     """
 
-    def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
+    def propagate(self, state: Array, rows: Index | slice) -> tuple[Array, Array]:
         """Flight, impact, flight."""
-        heights = self._surfaces(rows)
-        after, _, jacobian = fly_through_jacobian(self.model, state, self._tensor(self.dt[rows]), heights)
+        after, _, jacobian = arrays.fly_through_jacobian(self.model, state, self.dt[rows], tuple(self.heights[rows].T))
         return after, jacobian
 
     def transition(self, state: Tensor) -> Tensor:
         """Flight, impact, flight."""
-        return fly_through(self.model, state, torch.from_numpy(self.dt), self._surfaces(slice(None)))[0]
+        from ballfg.dynamics.motion.contact import fly_through
+
+        heights = tuple(torch.from_numpy(plain(column)) for column in self.heights.T)
+        return fly_through(self.model, state, torch.from_numpy(self.dt), heights)[0]
 
     def _levels(self, rows: Index | slice) -> Array:
         """(k, c) m, the surfaces in some of the intervals."""
         return plain(self.heights[rows])
-
-    def _surfaces(self, rows: Index | slice) -> tuple[Tensor, ...]:
-        """The heights (k,) of some rows, one tensor for each of the c contacts."""
-        return tuple(self._tensor(column) for column in self.heights[rows].T)
 
     def contact_times(self, values: Values) -> Array:
         """(m, c) s since the start of each interval; NaN if the ball never reaches the surface."""
@@ -250,9 +247,7 @@ class ContactFactors(SurfaceFactors):
         if self.width:
             own = np.broadcast_to(values.coefficients[: self.width], (len(self), self.width))
             start = np.concatenate((start, own), axis=-1)
-        heights = self._surfaces(slice(None))
-        with torch.no_grad():
-            return fly_through(self.model, torch.from_numpy(start), torch.from_numpy(self.dt), heights)[1].numpy()
+        return arrays.fly_through(self.model, start, self.dt, tuple(self.heights.T))[1]
 
 
 class RestFactors(SurfaceFactors):
@@ -265,10 +260,12 @@ class RestFactors(SurfaceFactors):
         """The same factors: their rows are computed one by one."""
         return self
 
-    def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
+    def propagate(self, state: Array, rows: Index | slice) -> tuple[Array, Array]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""
-        return roll_jacobian(self.model, state, self._tensor(self.dt[rows]), self._tensor(self.heights[rows]))
+        return arrays.roll_jacobian(self.model, state, self.dt[rows], self.heights[rows])
 
     def transition(self, state: Tensor) -> Tensor:
         """Rolling over dt."""
+        from ballfg.dynamics.motion.rollout import roll
+
         return roll(self.model, state, torch.from_numpy(self.dt), torch.from_numpy(self.heights))

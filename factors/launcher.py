@@ -1,19 +1,23 @@
 """A launcher factor compares the first spin with the one that a launcher's settings give along the flight."""
 
+from __future__ import annotations
+
 from collections.abc import Hashable
 from functools import partial
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.dynamics.motion.integrate import batch_jacobian
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.deferred import torch
 from ballfg.factors.batch import FactorBatch, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 
 
 class LauncherSpinFactors(FactorBatch):
@@ -52,6 +56,8 @@ class LauncherSpinFactors(FactorBatch):
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 3) and Jacobians (k, 3, 9)."""
+        from ballfg.dynamics.motion.integrate import batch_jacobian
+
         settings, sigma = torch.from_numpy(self.settings[rows]), torch.from_numpy(self.sigma[rows])
         function = partial(_whitened, self.embedding, settings, sigma)
         residual, jacobian = batch_jacobian(function, torch.from_numpy(inputs[0]), outputs=3)

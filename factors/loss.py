@@ -1,20 +1,22 @@
 """Robust losses reduce the weight of large whitened residuals; they equal GTSAM's m-estimators."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_number
+from ballfg.deferred import torch
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, REAL
 
 if TYPE_CHECKING:
     import gtsam
+    from torch import Tensor
 
 LEAST_STRETCH = 0.05
 """Least curvature along the residual, for a finite step where the loss is straight or concave."""
@@ -56,7 +58,7 @@ class Loss:
         return NAMES.index(self.name)
 
     @property
-    def convex(self) -> "Loss":
+    def convex(self) -> Loss:
         """The loss itself if it is convex; Huber's in place of Cauchy's."""
         return Loss("huber", self.scale) if self.name == "cauchy" else self
 
@@ -106,7 +108,7 @@ class Loss:
             ratio = np.ones_like(norm)
         return np.maximum(ratio, LEAST_STRETCH)
 
-    def noise_model(self, dim: int) -> "gtsam.noiseModel.Base":
+    def noise_model(self, dim: int) -> gtsam.noiseModel.Base:
         """GTSAM's model of this loss on a whitened residual of `dim` numbers."""
         import gtsam  # it takes a tenth of a second to import, and the own solver needs none of it
 

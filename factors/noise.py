@@ -4,17 +4,22 @@ Over an interval the acceleration adds what `white_acceleration` says; spin is a
 same model.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import as_float
+from ballfg.deferred import torch
 from ballfg.dynamics.compiled.flight import white_acceleration
 from ballfg.state import STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,7 @@ class ProcessNoise:
         tangential = np.hypot(self.contact_velocity, self.contact_tangential)
         return self.kick(dt, time, (tangential, tangential, self.contact_velocity), self.contact_spin)
 
-    def kicks(self, dt: Array, kicks: "Kicks") -> Array:
+    def kicks(self, dt: Array, kicks: Kicks) -> Array:
         """(m, 9, 9) covariance at the end of intervals dt (m,) s of the contacts and hits in them."""
         covariance = np.zeros((len(dt), STATE_DIM, STATE_DIM))
         for time in kicks.times.T:
@@ -112,11 +117,11 @@ class Kicks:
     hit: NDArray[np.bool_]
 
     @staticmethod
-    def none(count: int) -> "Kicks":
+    def none(count: int) -> Kicks:
         """Free flight in all intervals."""
         return Kicks(np.zeros((count, 0)), np.zeros(count, dtype=bool))
 
-    def __getitem__(self, rows: NDArray[np.int64] | slice) -> "Kicks":
+    def __getitem__(self, rows: NDArray[np.int64] | slice) -> Kicks:
         return Kicks(self.times[rows], self.hit[rows])
 
     def basis(self, dt: Array) -> Array:

@@ -1,15 +1,19 @@
 """A position factor compares a measured position with the state's."""
 
-from typing import ClassVar
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
+from ballfg.deferred import torch
 from ballfg.factors.batch import DiagonalFactors, Noise, check_measured
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class PositionFactors(DiagonalFactors):

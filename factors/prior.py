@@ -1,17 +1,25 @@
 """Prior factors tie a state, its spin alone, or the shared coefficients to a mean with standard deviations."""
 
+from __future__ import annotations
+
 from collections.abc import Hashable
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.deferred import torch
+from ballfg.dynamics.compiled.kept_model import carried
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.augmented import AugmentedModel
+    from ballfg.dynamics.model import BallModel
 
 
 class PriorFactors(FactorBatch):
@@ -65,11 +73,12 @@ class CoefficientPriorFactors(PriorFactors):
     Raises: ValueError: if a sigma is not positive and finite.
     """
 
-    def __init__(self, model: AugmentedModel, sigma: Array, others: int = 0) -> None:
+    def __init__(self, model: BallModel, sigma: Array, others: int = 0) -> None:
         _check_sigma(sigma)
         self.model = model
         self.others = others
-        mean = np.append(model.means().detach().numpy(), np.zeros(others))
+        inner, names = carried(model)
+        mean = np.append([numbers_of(inner).value(name) for name in names], np.zeros(others))
         root = np.pad(np.diag(1.0 / sigma), ((0, 0), (0, others)))
         super().__init__(np.array([COEFFICIENTS]), mean[None], root[None])
 
@@ -80,7 +89,7 @@ class CoefficientPriorFactors(PriorFactors):
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, p) whitened residuals in torch, differentiable in the model's own values too."""
-        means = self.model.means()
+        means = cast("AugmentedModel", self.model).means()
         return self._whitened(inputs[0] - torch.cat((means, means.new_zeros(self.others))))
 
 

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LEVELS = (
     ("interrupts",),
-    ("state", "arrays", "checks", "registry", "machine", "collector"),
+    ("state", "arrays", "checks", "registry", "machine", "deferred", "collector"),
     ("progress",),
     ("files",),
     ("parallel",),

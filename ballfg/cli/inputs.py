@@ -295,15 +295,20 @@ def _opened(
 def _named(ball: str) -> "tuple[Ball, AnalyticModel]":
     """A ball and its model: a known one by its name, or that of a ball file."""
     from ballfg.dynamics import nominal_model
-    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
 
     if Path(ball).is_file():
         from ballfg.simulation.balls import ball_kind
 
         kind = ball_kind(ball)
         return kind.ball, kind.model
-    name = known_ball(ball)
-    return KNOWN_BALLS[name].ball, nominal_model(name)
+    return _known(ball), nominal_model(_known(ball))
+
+
+def _known(ball: str) -> "Ball":
+    """A known ball by its name."""
+    from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+
+    return KNOWN_BALLS[known_ball(ball)].ball
 
 
 def _doubts_of(data: "Dataset | SightedDataset", model: "BallModel", file: Path | None) -> tuple[str, ...]:
@@ -323,18 +328,24 @@ def model_alone(model: Path | None, ball: str | None) -> "tuple[BallModel, Setti
 
     Args: ball: name of the known ball that gives radius and inertia, or a ball file; None: table tennis.
     """
-    from ballfg.dynamics import load_model
+    from ballfg.dynamics.compiled.kept_model import ready_file
+    from ballfg.dynamics.nominal import ready_nominal
     from ballfg.estimation import Settings
-    from ballfg.estimation.configure import learned_process
-    from ballfg.estimation.noise.parameters import with_noise
 
-    loaded: BallModel = (known := _named(ball or "table_tennis")[1])
+    file = ball is not None and Path(ball).is_file()
+    loaded: BallModel = (known := _named(ball)[1] if file else ready_nominal(_known(ball or "table_tennis")))
     if model is not None:
-        loaded = load_model(model, radius=None if ball is None else known.radius, inertia_factor=known.inertia_factor)
+        loaded = ready_file(model, radius=None if ball is None else known.radius, inertia_factor=known.inertia_factor)
     settings = Settings.for_measured(loaded)
     if loaded.trained is not None:
+        from ballfg.estimation.configure import learned_process
+
         settings = Settings(position_scale=loaded.trained.position_scale, process=learned_process(loaded.trained))
-    return loaded, settings if loaded.noise is None else with_noise(settings, loaded.noise)
+    if loaded.noise is None:
+        return loaded, settings
+    from ballfg.estimation.noise.parameters import with_noise
+
+    return loaded, with_noise(settings, loaded.noise)
 
 
 def check_out(out: Path, dataset: Path) -> None:

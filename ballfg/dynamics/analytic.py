@@ -7,9 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.checks import check_each
+from ballfg.dynamics.coefficient import THIN_SHELL
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, per_row
 from ballfg.dynamics.measurement import Later, MeasurementEffect
-from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
+from ballfg.dynamics.model import BallModel, Rates
 from ballfg.dynamics.motion.impact import apply_impulse, from_plane, to_plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
@@ -176,12 +177,3 @@ def _sum(terms: Iterable[Tensor | None]) -> Tensor | None:
 def _overriding(group: nn.ModuleDict, base: type[Effect], method: str) -> tuple[str, ...]:
     """Names of the effects of a group that override a method of their base class."""
     return tuple(name for name, effect in group.items() if getattr(type(effect), method) is not getattr(base, method))
-
-
-def coefficient_sigmas(model: BallModel) -> dict[str, float]:
-    """Prior standard deviations of the coefficients that are estimated with each track, by parameter name.
-
-    Args: model: a model without declared coefficients gives an empty mapping.
-    Returns: for instance {"flight.drag.k": 0.035}; those that do not vary, or are known, are left out.
-    """
-    return {name: c.sigma for name, c in model.declared_coefficients().items() if c.varies and c.sigma > 0.0}

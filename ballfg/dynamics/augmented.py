@@ -87,11 +87,6 @@ class AugmentedModel(BallModel):
         return torch.cat((state, coefficients.expand(*state.shape[:-1], self.width)), dim=-1)
 
 
-def augmented(model: BallModel, names: Sequence[str]) -> BallModel:
-    """The model with some coefficients read from the state; the model itself for none."""
-    return AugmentedModel(model, names) if names else model
-
-
 def _is_scalar(model: BallModel, name: str) -> bool:
     try:
         return model.get_parameter(name).dim() == 0

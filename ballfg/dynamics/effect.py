@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.checks import as_float
+from ballfg.dynamics.coefficient import Coefficient as Coefficient
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 
@@ -39,28 +40,6 @@ class Usual:
     source: str
     graded: bool = True
     """True if the effect has a size; False if it is present or absent."""
-
-
-@dataclass(frozen=True)
-class Coefficient:
-    """One number of an effect: its name, nominal value, prior spread, unit, bounds and where they come from."""
-
-    name: str
-    default: float
-    """Nominal value for a table-tennis ball."""
-    sigma: float
-    """Prior standard deviation, from the spread of real balls, tables and cameras. 0: a constant."""
-    unit: str
-    """SI unit, `1` where the number has none."""
-    low: float
-    """Smallest value accepted."""
-    high: float
-    """Largest value accepted."""
-    varies: bool = False
-    """True if the coefficient differs between balls or days by more than one track can resolve: fit per track."""
-    absent: float | None = 0.0
-    """The value at which the effect vanishes. None for a shape (a reference, a centre, a size), which changes nothing
-    while all other coefficients of its effect are absent."""
 
 
 TINY_LENGTH = 1e-12  # In the vector's own unit. Autograd takes shorter lengths as constant

@@ -7,7 +7,7 @@ from importlib.resources.abc import Traversable
 from typing import Any, Final
 
 from ballfg.checks import check_text, did_you_mean
-from ballfg.dynamics.model import THIN_SHELL
+from ballfg.dynamics.coefficient import THIN_SHELL
 from ballfg.files.strict_yaml import parse_yaml
 from ballfg.tracks import Ball
 

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.checks import as_float
+from ballfg.dynamics.coefficient import THIN_SHELL, Coefficient
 from ballfg.dynamics.domain import Domain
-from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.motion.impact import slip_velocity
+from ballfg.dynamics.variation import values_of_group, values_of_track
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from ballfg.tracks.noise import TrackNoise
 
 BASE: Final = "base."  # Prefix of the names of the coefficients of the model that a learned one corrects
-THIN_SHELL: Final = 2.0 / 3.0  # Moment of inertia of a thin spherical shell divided by m R^2
 
 ROLLING_FRICTION: Final = 0.25  # Coulomb coefficient that turns a resting ball's slip into rolling
 ROLLING_RESISTANCE: Final = 0.01  # Deceleration of a rolling ball divided by g
@@ -84,22 +84,14 @@ class BallModel(nn.Module, ABC):
 
     def for_track(self, track: "Track") -> Self:
         """The model with the coefficients of one track; the model itself if none differ between tracks."""
-        model = self
-        for name, variation in self.variations.items():
-            if (value := variation.value(track)) is not None:
-                model = _with_value(model, name, value)
-        return model
+        return with_values(self, values_of_track(self.variations, track))
 
     def for_group(self, by: str, group: str) -> Self:
         """The model with the coefficients of a group of tracks, such as a stream of one launcher's shots.
 
         Args: by: the label that names groups.  group: its value.
         """
-        model = self
-        for name, variation in self.variations.items():
-            if variation.by == by and (value := variation.of_label(group)) is not None:
-                model = _with_value(model, name, value)
-        return model
+        return with_values(self, values_of_group(self.variations, by, group))
 
     @property
     def in_flight(self) -> "BallModel":
@@ -258,6 +250,13 @@ def substitute(module: M, values: Mapping[str, Tensor]) -> M:
 def is_substituted(module: nn.Module) -> bool:
     """True if the module is a copy by `substitute`."""
     return any(_SUBSTITUTED in part.__dict__ for part in module.modules())
+
+
+def with_values(module: M, values: Mapping[str, float]) -> M:
+    """A copy of a module with other values of some scalar parameters, by name; the module itself for none."""
+    for name, value in values.items():
+        module = _with_value(module, name, value)
+    return module
 
 
 def _with_value(module: M, name: str, value: float) -> M:

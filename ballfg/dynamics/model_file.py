@@ -10,11 +10,11 @@ import yaml
 
 from ballfg.checks import check_path, check_range, shown
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
+from ballfg.dynamics.coefficient import THIN_SHELL, todays_name
 from ballfg.dynamics.domain import Domain
-from ballfg.dynamics.earlier_names import todays_name
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import EFFECTS, GENERIC, LEARNED, effect_class
-from ballfg.dynamics.model import BASE, THIN_SHELL, BallModel
+from ballfg.dynamics.model import BASE, BallModel
 from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml

@@ -1,16 +1,22 @@
 """Chooses the nominal model of a ball: a known ball's model, else a guess from radius and mass."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
-from typing import Final, cast
+from functools import partial
+from typing import TYPE_CHECKING, Final, cast
 
 from ballfg.checks import is_number, shown, type_name
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.coefficient import THIN_SHELL
+from ballfg.dynamics.compiled.kept_model import keep, ready
 from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball, nominal_content
-from ballfg.dynamics.model import THIN_SHELL
-from ballfg.dynamics.model_file import model_from_dict
 from ballfg.tracks import TABLE_TENNIS, Ball
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.analytic import AnalyticModel
+    from ballfg.dynamics.effect import Effect
+    from ballfg.dynamics.model import BallModel
 
 TOLERANCE: Final = 0.15  # Relative. A ball whose radius and mass differ by less from a known ball's counts as that ball
 AIR_DENSITY: Final = 1.2  # kg/m^3, dry air at 20 degrees C and 1013 hPa
@@ -48,6 +54,20 @@ def nominal_model(ball: Ball | float | str = TABLE_TENNIS) -> AnalyticModel:
         return _known_model("table_tennis", ball)
     name = known_name(ball)
     return _guessed_model(ball) if name is None else _known_model(name, ball.radius)
+
+
+def ready_nominal(ball: Ball = TABLE_TENNIS) -> BallModel:
+    """`nominal_model` for an estimate, which does not change it: without torch where its machine code is kept."""
+    return ready(partial(_about, ball), partial(nominal_model, ball))
+
+
+def keep_nominal(ball: Ball) -> None:
+    """Keeps what `ready_nominal` needs."""
+    keep(_about(ball), nominal_model(ball))
+
+
+def _about(ball: Ball) -> str:
+    return f"nominal, {known_name(ball) or ball.mass!r}, {ball.radius!r}"
 
 
 def nominal_note(ball: Ball) -> str | None:
@@ -91,6 +111,8 @@ def mismatch(ball: Ball, known: Ball) -> float:
 
 
 def _known_model(name: str, radius: float) -> AnalyticModel:
+    from ballfg.dynamics.model_file import model_from_dict
+
     known = KNOWN_BALLS[name]
     content, where = nominal_content(name), f"{name}.yaml"
     model = model_from_dict(content, radius=radius, inertia_factor=known.inertia_factor, where=where)
@@ -99,6 +121,8 @@ def _known_model(name: str, radius: float) -> AnalyticModel:
 
 
 def _guessed_model(ball: Ball) -> AnalyticModel:
+    from ballfg.dynamics.model_file import model_from_dict
+
     drag, magnus = air_coefficients(ball)
     flight = {"gravity": {}, "drag": {"k": drag}, "magnus": {"k": magnus}}
     bounce = {**GUESSED_BOUNCE, "table_height": {}}
@@ -111,7 +135,7 @@ def _set_spread(model: AnalyticModel, shares: Mapping[str, float]) -> None:
     """Let the one coefficient of some effects vary, with a prior standard deviation that is a share of its value."""
     effects = {name: effect for group in (model.flight, model.bounce) for name, effect in group.items()}
     for name, share in shares.items():
-        effect = cast(Effect, effects[name])
+        effect = cast("Effect", effects[name])
         (coefficient,) = effect.coefficients
         give = effect.set_sigmas if name in TAKEN_UP else effect.vary
         give(**{coefficient.name: share * abs(float(getattr(effect, coefficient.name).detach()))})
@@ -122,7 +146,7 @@ def spread_like(model: AnalyticModel, usual: AnalyticModel) -> None:
     for own, others in ((model.flight, usual.flight), (model.bounce, usual.bounce)):
         effects, known = dict(own.items()), dict(others.items())
         for name in effects.keys() & known.keys():
-            effect, other = cast(Effect, effects[name]), cast(Effect, known[name])
+            effect, other = cast("Effect", effects[name]), cast("Effect", known[name])
             for one in other.coefficients:
                 value, size = (abs(float(getattr(each, one.name).detach())) for each in (effect, other))
                 if one.sigma is not None and size > 0.0:

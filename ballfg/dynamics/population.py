@@ -12,9 +12,11 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import check_number, listed, shown
-from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
 from ballfg.tracks.track import Label, label_text, level_of
 
+SOFT_SPEED: Final = 0.05
+"""m/s. Well below it a launch has no horizontal direction and its forward and across axes fade out; at 5 m/s they are
+5e-5 short of one."""
 FASTEST: Final = 5000.0  # rad/s. Largest mean and spread; a larger one is in another unit
 UNSEEN: Final = ""  # Name of a group that no label has
 _FIELDS: Final = ("by", "groups")

@@ -101,3 +101,18 @@ class Variation:
         """The mapping that `from_mapping` reads."""
         line = {"line": True} if self.line else {}
         return {"by": self.by, "values": dict(self.values), **line}
+
+
+def values_of_track(variations: Mapping[str, Variation], track: Track) -> dict[str, float]:
+    """The values that a track gives to varying coefficients, by name."""
+    found = {name: variation.value(track) for name, variation in variations.items()}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def values_of_group(variations: Mapping[str, Variation], by: str, group: str) -> dict[str, float]:
+    """The values that a group of tracks gives to varying coefficients, by name.
+
+    Args: by: the label that names groups.  group: its value.
+    """
+    found = {name: variation.of_label(group) for name, variation in variations.items() if variation.by == by}
+    return {name: value for name, value in found.items() if value is not None}

@@ -1,14 +1,16 @@
 """Defines the interface of all estimators."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from ballfg.checks import as_float, check_instance, is_number, shown
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.nominal import nominal_model
+from ballfg.dynamics.compiled.kept_model import check_model
+from ballfg.dynamics.nominal import ready_nominal
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.measurement.position_noise import noise_doubts
 from ballfg.estimation.observations.observation import given
@@ -18,6 +20,9 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.prediction.state import World
 from ballfg.tracks import Ball, Track
 from ballfg.tracks.checks import check_scale, doubts_about
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 LEAST_CHECKED = 3  # Least number of samples for a check of a track's scale
 
@@ -43,8 +48,8 @@ class Estimator(ABC):
     """True if GTSAM can solve it (`Settings.solver`)."""
 
     def __init__(self, model: BallModel | Ball, surfaces: Surfaces | float, settings: Settings | None = None) -> None:
-        model = nominal_model(model) if isinstance(model, Ball) else model
-        check_instance("model", model, BallModel, "Load one with load_model, or give the Ball.")
+        model = ready_nominal(model) if isinstance(model, Ball) else model
+        check_model(model, "Load one with load_model, or give the Ball.")
         table = Surfaces.table_tennis(as_float("surfaces", surfaces, "m")) if is_number(surfaces) else surfaces
         known: Surfaces = check_instance("surfaces", table, Surfaces, "Give the height of the table in m, or Surfaces.")
         settings = Settings.for_measured(model) if settings is None else settings
@@ -72,7 +77,7 @@ class Estimator(ABC):
         noise = " / ".join(f"{1e3 * s:g}" for s in self.settings.position_noise)
         return f"{type(self).__name__}({effects}, {self.surfaces}, noise {noise} mm)"
 
-    def of(self, track: Track) -> "Estimator":
+    def of(self, track: Track) -> Estimator:
         """The estimator with the coefficients of a track; the same one if none differ between tracks."""
         return self
 

@@ -1,19 +1,24 @@
 """A launcher gives the spin of a shot from the launcher settings in a track's labels."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ballfg.checks import check_number
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.dynamics.population import SpinPopulation, launch_axes
+from ballfg.deferred import torch
+from ballfg.dynamics.population import launch_axes
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS, label_text
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+    from ballfg.dynamics.population import SpinPopulation
 
 FIRST_SAMPLES = 10  # Number of samples whose mean direction of flight is the launch direction
 SHOWN = 20.0
@@ -73,6 +78,8 @@ class Launcher:
 
         Args: topspin, sidespin: rad/s per level.  sigma: as in the class.
         """
+        from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+
         rows = torch.tensor([[0.0, topspin, 0.0], [0.0, 0.0, sidespin]], dtype=torch.float64)
         return cls(SpinEmbedding(("topspin", "sidespin"), {}, rows), sigma)
 

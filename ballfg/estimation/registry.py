@@ -1,13 +1,15 @@
 """Registers the estimators by name: those of the package, of the user, and of other installed packages."""
 
+from __future__ import annotations
+
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from ballfg.checks import check_instance, shown
-from ballfg.dynamics.model import BallModel
+from ballfg.checks import shown
+from ballfg.dynamics.compiled.kept_model import check_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.result import Estimate
@@ -15,6 +17,9 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.registry import Registry
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 
 class EachItsModel(Estimator):
@@ -74,7 +79,7 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, sett
     """
     if name not in ESTIMATORS:
         raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got {shown(name)}. Choose one.")
-    check_instance("model", model, BallModel, "Load one with load_model.")
+    check_model(model, "Load one with load_model.")
     make = partial(_estimator, ESTIMATORS[name], surfaces, settings)
     if not model.variations:
         return make(model)

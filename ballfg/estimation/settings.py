@@ -1,8 +1,10 @@
 """Holds the noise of measurements and motion and the priors, which all estimators share."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
@@ -17,15 +19,17 @@ from ballfg.checks import (
     shown,
     type_name,
 )
-from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.earlier_names import todays_name, todays_names
-from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.coefficient import coefficient_sigmas, todays_name, todays_names
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.estimation.launcher import Launcher, SpinLabel, group_spin
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
 from ballfg.tracks.track import label_text, level_of
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 Solver = Literal["ballfg", "gtsam"]
 SOLVERS: Final[tuple[Solver, ...]] = get_args(Solver)
@@ -160,7 +164,7 @@ class Settings:
             raise TypeError(f"launcher must be a Launcher or None; got {got}. Read one from its file.")
 
     @classmethod
-    def for_measured(cls, model: BallModel, **changes: Any) -> "Settings":
+    def for_measured(cls, model: BallModel, **changes: Any) -> Settings:
         """Settings for measured tracks: the model's coefficients are estimated with each track within their priors.
 
         Args: model: gives the coefficients and their prior standard deviations, the noise that its file states, and the
@@ -183,7 +187,7 @@ class Settings:
         """(3,) m, standard deviations of the lasting errors; a tiny one for an axis without any."""
         return np.maximum(self.memory, LEAST_BIAS)
 
-    def for_track(self, track: Track) -> "Settings":
+    def for_track(self, track: Track) -> Settings:
         """The settings of a track: positions computed from other observations have no tracker's errors.
 
         A track that one camera saw has an acceleration noise and a spin prior of its own.
@@ -204,12 +208,12 @@ class Settings:
             return track
         return replace(track, labels={**track.labels, self.spins.by: self.group})
 
-    def renamed(self, model: BallModel) -> "Settings":
+    def renamed(self, model: BallModel) -> Settings:
         """These settings with today's names of the model's coefficients."""
         earlier = [name for name in self.coefficients if todays_name(name) != name]
         if not earlier:
             return self
-        known = {name for name, _ in model.named_parameters()}
+        known = {*numbers_of(model).scalars, *numbers_of(model).arrays}
         names = todays_names(self.coefficients, known)
         return replace(self, coefficients=dict(zip(names, self.coefficients.values(), strict=True)))
 

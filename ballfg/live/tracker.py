@@ -1,15 +1,18 @@
 """Tracks any number of balls: positions come in, states go out, one stamp at a time."""
 
+from __future__ import annotations
+
 from bisect import insort
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.checks import as_float, check_array, check_count, check_range
-from ballfg.dynamics import BallModel, Surfaces
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.scatter import StreamScatter
 from ballfg.estimation.online.state import OnlineState
@@ -19,6 +22,9 @@ from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
 from ballfg.tracks import Ball as BallKind
 from ballfg.tracks.stamps import StreamOrigin
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 GAP = 0.5  # s. A ball unseen for longer is lost; the estimator links nothing over longer gaps either.
 CONFIRM = 3  # Number of consistent samples that make a ball: the least that allow a check of the velocity

@@ -1,20 +1,27 @@
 """A belief holds Gaussian states at one time, with the model coefficients of their estimate."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
-from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.model import BallModel
+from ballfg.deferred import torch
+from ballfg.dynamics.compiled.kept_model import augmented, carried
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.prediction.state import BallState
 from ballfg.state import STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.model import BallModel
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,7 @@ class Belief:
     @classmethod
     def of(
         cls, model: BallModel, states: Sequence[BallState], coefficients: Mapping[str, float] | None = None
-    ) -> "Belief":
+    ) -> Belief:
         """The belief of some states that were estimated with the same model.
 
         A coefficient beyond the bounds of its effect (a restitution above 1, say) is moved to the bound, and the state
@@ -61,8 +68,8 @@ class Belief:
                     f"states must share their coefficients; that of track {shown(state.name)} has {list(own)}, "
                     f"not {list(names)}. Make them with the same settings."
                 )
-        bounded = AugmentedModel(model, names) if names else model
-        prior_mean = np.array([float(model.get_parameter(name).detach()) for name in names])
+        bounded = augmented(model, names)
+        prior_mean = np.array([numbers_of(model).value(name) for name in names])
         low, high = _bounds(model, names)
         joints = [_joint(state, names, prior_mean, np.array(list(prior.values()))) for state in states]
         mean = np.stack([_held(m, covariance, low, high) for m, covariance in joints])
@@ -79,20 +86,18 @@ class Belief:
         Args: states: (n, 9 + p) m, m/s, rad/s, then the coefficients in their own units.
         Returns: (n, 9 + p) in the same units, with coefficients beyond a bound moved to it.
         """
-        if not isinstance(self.model, AugmentedModel):
-            return states
-        held = np.clip(states[:, STATE_DIM:], *_bounds(self.model.model, self.model.names))
+        held = np.clip(states[:, STATE_DIM:], *_bounds(*carried(self.model)))
         return np.concatenate((states[:, :STATE_DIM], held), axis=1)
 
     def __len__(self) -> int:
         return len(self.time)
 
-    def from_zero(self) -> "Belief":
+    def from_zero(self) -> Belief:
         """The belief with time counted from now, against the rounding of large stamps."""
         return replace(self, time=torch.zeros_like(self.time))
 
     @staticmethod
-    def joined(beliefs: "Sequence[Belief]") -> "Belief":
+    def joined(beliefs: Sequence[Belief]) -> Belief:
         """All balls of some beliefs.
 
         Args:
@@ -105,7 +110,7 @@ class Belief:
             torch.cat([belief.covariance for belief in beliefs]),
         )
 
-    def take(self, rows: Tensor | slice) -> "Belief":
+    def take(self, rows: Tensor | slice) -> Belief:
         """A part of the balls.
 
         Args:

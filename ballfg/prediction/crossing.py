@@ -4,32 +4,35 @@ An event is a function g of the state that changes sign. At the crossing time th
 g = 0: a ball that is late is further back but crosses at the same place (docs/derivations/prediction.md).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_number
+from ballfg.deferred import torch
 from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.flight_step import RateFunction, derivative
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly
 from ballfg.dynamics.motion.limits import MAX_STEP
-from ballfg.dynamics.motion.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.plane import Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VZ
 
-EventFunction = Callable[[Tensor], Tensor]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.model import BallModel
+    from ballfg.dynamics.motion.flight_step import RateFunction
+
+EventFunction = Callable[["Tensor"], "Tensor"]
 """(..., d) states to (..., 1) values; the event is where the value falls through zero."""
 SearchStep = Callable[[Belief, float, float], tuple["Crossing | None", Belief]]
 """From a belief, the end of a search and the time (s) from which events count to an event and the belief then."""
@@ -54,7 +57,7 @@ class Crossing:
     state: Array
     covariance: Array
 
-    def later(self, seconds: float) -> "Crossing":
+    def later(self, seconds: float) -> Crossing:
         """The same event on a clock that is ahead by some seconds."""
         return replace(self, time=self.time + seconds)
 
@@ -212,6 +215,10 @@ def _crossing_step(
 
 def _contact_within(model: BallModel, mean: Tensor, h: Tensor, surfaces: Surfaces) -> tuple[Tensor, float] | None:
     """Time (1,) s until a falling ball meets a surface in a step, and that surface's height; None if it does not."""
+    from ballfg.dynamics.motion.contact import contact_time
+    from ballfg.dynamics.motion.integrate import fly
+    from ballfg.dynamics.motion.rollout import is_resting
+
     with torch.no_grad():
         after = fly(model, mean, h)
         for height in surfaces.heights():
@@ -252,6 +259,8 @@ def _crossings(
 
 def _mean_at(belief: Belief, times: Tensor, surfaces: Surfaces) -> Tensor:
     """(k, d) means of one ball at times (k,) s from the belief's, all within one step."""
+    from ballfg.dynamics.motion.rollout import advance
+
     with torch.no_grad():
         later = advance(belief.model, belief.mean.expand(len(times), -1), times, surfaces)
         return torch.where((times > 0.0).unsqueeze(-1), later, belief.mean)  # a ball at a contact has not bounced yet
@@ -259,6 +268,8 @@ def _mean_at(belief: Belief, times: Tensor, surfaces: Surfaces) -> Tensor:
 
 def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
     """Rate of change of the state by air and weight or, at rest, friction."""
+    from ballfg.dynamics.motion.rollout import is_resting
+
     with torch.no_grad():
         level = propagator.surfaces.level_below(belief.mean, belief.model.surface_offset(belief.mean))
         resting = bool(is_resting(belief.model, belief.mean, level))
@@ -267,6 +278,9 @@ def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
 
 
 def _at_event(there: Belief, event: EventFunction, rates: RateFunction) -> Crossing:
+    from ballfg.dynamics.motion.flight_step import derivative
+    from ballfg.dynamics.motion.integrate import batch_jacobian
+
     _, gradient = batch_jacobian(event, there.mean, outputs=1)
     with torch.no_grad():
         rate = derivative(rates, there.mean)

@@ -11,13 +11,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
+from ballfg.deferred import torch
 from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
-from ballfg.dynamics.motion.rollout import is_resting, place_on
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief, normal_points, root_of
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
@@ -125,26 +124,26 @@ def _sooner(found: Crossing, left: float) -> float:
     return 0.5 * math.erfc(-left / (math.sqrt(2.0) * max(found.time_sigma, np.finfo(float).tiny)))
 
 
-@torch.no_grad()
 def _other_contact(path: "Path", found: Crossing | None) -> tuple[float, Crossing | None]:
     """The share of balls on the other side of a present bounce, and their next contact; None without any doubt.
 
     The share follows from the variance of the vertical speed that the doubt gives and the jump of that speed.
     """
-    start, belief = path.start, path.carried[1]
-    variance = 0.0 if start.other_side is None else float(start.other_side[VZ, VZ])
-    rises, before = float(start.state[VZ]) > 0.0, belief.mean.clone()
-    if variance <= 0.0 or (found is None and not rises):
-        return 0.0, None
-    if found is not None and not rises:
-        before[0, :STATE_DIM] = torch.from_numpy(found.state)
-        other = path.contact(found.time)
-    else:
-        before[0, VZ] *= -1.0  # had it come down as fast as it rises, it would rise more slowly, by the restitution
-        before[0, VZ] = -(before[0, VZ] ** 2) / belief.model.after_bounce(before)[0, VZ]
-        other = Crossing(start.time, 0.0, before[0, :STATE_DIM].numpy(), start.covariance)
-    jump = float(belief.model.after_bounce(before)[0, VZ] - before[0, VZ])
-    return min(variance / jump**2, MOST), other
+    with torch.no_grad():
+        start, belief = path.start, path.carried[1]
+        variance = 0.0 if start.other_side is None else float(start.other_side[VZ, VZ])
+        rises, before = float(start.state[VZ]) > 0.0, belief.mean.clone()
+        if variance <= 0.0 or (found is None and not rises):
+            return 0.0, None
+        if found is not None and not rises:
+            before[0, :STATE_DIM] = torch.from_numpy(found.state)
+            other = path.contact(found.time)
+        else:
+            before[0, VZ] *= -1.0  # had it come down as fast as it rises, it would rise more slowly, by the restitution
+            before[0, VZ] = -(before[0, VZ] ** 2) / belief.model.after_bounce(before)[0, VZ]
+            other = Crossing(start.time, 0.0, before[0, :STATE_DIM].numpy(), start.covariance)
+        jump = float(belief.model.after_bounce(before)[0, VZ] - before[0, VZ])
+        return min(variance / jump**2, MOST), other
 
 
 def _chance_of(path: "Path", plane: Plane) -> float:
@@ -176,16 +175,18 @@ def event_numbers(found: Crossing | None) -> dict[str, float]:
     return numbers | {f"cov_{AXES[i]}{AXES[j]}": float(spread[i, j]) for i, j in ((0, 1), (0, 2), (1, 2))}
 
 
-@torch.no_grad()
 def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
     """States and coefficients (n, 9 + p) at some errors; if the mean lies on a surface, so do all."""
-    mean, model = belief.mean, belief.model
-    start = mean + torch.from_numpy(errors)
-    if abs(float(mean[0, VZ])) <= REST_SPEED:
-        level = surfaces.level_below(mean, model.surface_offset(mean))
-        if bool(is_resting(model, mean, level)):
-            start = place_on(model, start, level)
-    return belief.within_bounds(start.numpy())
+    from ballfg.dynamics.motion.rollout import is_resting, place_on
+
+    with torch.no_grad():
+        mean, model = belief.mean, belief.model
+        start = mean + torch.from_numpy(errors)
+        if abs(float(mean[0, VZ])) <= REST_SPEED:
+            level = surfaces.level_below(mean, model.surface_offset(mean))
+            if bool(is_resting(model, mean, level)):
+                start = place_on(model, start, level)
+        return belief.within_bounds(start.numpy())
 
 
 @dataclass(frozen=True)

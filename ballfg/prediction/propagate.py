@@ -5,26 +5,23 @@ Near a contact of uncertain time the reported mean and covariance include the ba
 (docs/derivations/prediction.md).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.deferred import torch
 from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, density_of
 from ballfg.dynamics.compiled.beliefs.edges import share_over_table
 from ballfg.dynamics.compiled.motion import world_of
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.arrays import advance_jacobian
-from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import fly, fly_jacobian
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, NEGLIGIBLE, steps_over_each
-from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
@@ -32,6 +29,9 @@ from ballfg.state import POSITION, STATE_DIM, VZ
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from torch import Tensor
+
+    from ballfg.dynamics.model import BallModel
 
 AT_ONCE = 128
 """Largest number of steps of free flight in one call of machine code: more would waste memory on covariances."""
@@ -50,7 +50,7 @@ class Prediction:
     states: Array
     covariances: Array
 
-    def plot(self, ball: int = 0) -> "Figure":
+    def plot(self, ball: int = 0) -> Figure:
         """A picture of x, y and z of one ball over time, each with the band that holds 90 %.
 
         Args: ball: index of the ball.
@@ -211,6 +211,8 @@ class Propagator:
 
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s of free flight, without surfaces."""
+        from ballfg.dynamics.motion.integrate import fly_jacobian
+
         after, jacobian = fly_jacobian(belief.model, belief.mean, dt)
         noise = torch.from_numpy(self.noise.flight(dt.numpy()))
         return replace(
@@ -222,6 +224,8 @@ class Propagator:
 
         The flight's noise before the first impact goes through it; each impact adds its own.
         """
+        from ballfg.dynamics.motion.integrate import fly_jacobian
+
         first = times[:, 0].clamp(torch.zeros_like(h), h)
         _, flight = fly_jacobian(model, mean, first)
         onward = torch.linalg.solve(flight.mT, jacobian.mT).mT[:, :STATE_DIM, :STATE_DIM]  # from the impact to the end
@@ -245,7 +249,6 @@ def _carried(jacobian: Tensor, covariance: Tensor, noise: Tensor) -> Tensor:
     return (after + after.transpose(-1, -2)) / 2  # rounding would add up
 
 
-@torch.no_grad()
 def _edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor | float:
     """Covariance at the end of a step from the balls that take the other way than the mean.
 
@@ -257,16 +260,21 @@ def _edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, s
         h: (1,) s, the step; at most one contact with the table.
     Returns: (9, 9); 0 if the ball does not come down to the table's level in the step, or far from every edge.
     """
-    height = mean.new_tensor([surfaces.table_height])
-    beside = fly(model, mean, h)
-    if surfaces.extent is None or not float(model.gap(mean, height)) >= 0.0 > float(model.gap(beside, height)):
-        return 0.0
-    touch = fly(model, mean, contact_time(model, mean, height))
-    if not float(touch[0, VZ]) < 0.0:
-        return 0.0
-    over = share_over_table(touch[0].numpy(), covariance[0].numpy(), world_of(surfaces, model.radius))
-    other = 1.0 - over if bool(surfaces.over_table(touch)) else over
-    if other < NEGLIGIBLE:
-        return 0.0
-    difference = (advance(model, mean, h, replace(surfaces, extent=None)) - beside)[0, :STATE_DIM]
-    return other * torch.outer(difference, difference)
+    from ballfg.dynamics.motion.contact import contact_time
+    from ballfg.dynamics.motion.integrate import fly
+    from ballfg.dynamics.motion.rollout import advance
+
+    with torch.no_grad():
+        height = mean.new_tensor([surfaces.table_height])
+        beside = fly(model, mean, h)
+        if surfaces.extent is None or not float(model.gap(mean, height)) >= 0.0 > float(model.gap(beside, height)):
+            return 0.0
+        touch = fly(model, mean, contact_time(model, mean, height))
+        if not float(touch[0, VZ]) < 0.0:
+            return 0.0
+        over = share_over_table(touch[0].numpy(), covariance[0].numpy(), world_of(surfaces, model.radius))
+        other = 1.0 - over if bool(surfaces.over_table(touch)) else over
+        if other < NEGLIGIBLE:
+            return 0.0
+        difference = (advance(model, mean, h, replace(surfaces, extent=None)) - beside)[0, :STATE_DIM]
+        return other * torch.outer(difference, difference)

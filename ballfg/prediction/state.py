@@ -1,17 +1,19 @@
 """Holds the estimated state of a ball at one time, the type that all estimators pass to prediction."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
     from ballfg.prediction.forecast import Forecast
 
 
@@ -94,7 +96,7 @@ class BallState:
         """(p,) model parameters, in their own units."""
         return self.mean[STATE_DIM:]
 
-    def predict(self, horizon: float, step: float = 0.01) -> "Forecast":
+    def predict(self, horizon: float, step: float = 0.01) -> Forecast:
         """The path of the ball from this state.
 
         Args: horizon: s.  step: s between the times of the path.
@@ -104,6 +106,6 @@ class BallState:
 
         return look_ahead(self, horizon, step)
 
-    def on(self, world: World) -> "BallState":
+    def on(self, world: World) -> BallState:
         """The same state with another model, surfaces and noise for predictions."""
         return replace(self, world=world)

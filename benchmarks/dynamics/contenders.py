@@ -14,7 +14,7 @@ from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.task import PathScore, Task
 from ballfg.benchmarks.results import Kept
 from ballfg.dynamics import BallModel, Surfaces, nominal_model
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation import Estimate, Settings, Smoother, Status
 from ballfg.factors.noise import ProcessNoise

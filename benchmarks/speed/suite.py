@@ -19,7 +19,7 @@ from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, para
 from ballfg.benchmarks.speed.robot import NO_SURFACE, path_of
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
 from ballfg.dynamics import AnalyticModel, Architecture, BallModel, build, nominal_model
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.model_file import model_from_dict
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.dynamics.networks.learned import LearnedModel

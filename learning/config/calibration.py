@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from ballfg.checks import shown
-from ballfg.dynamics.earlier_names import todays_names
+from ballfg.dynamics.coefficient import todays_names
 from ballfg.learning.config.training import Count, Jobs, Names, Positive, Section, Share
 
 Coefficients = Annotated[

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ballfg.checks import shown
-from ballfg.dynamics.earlier_names import warn_of
+from ballfg.dynamics.coefficient import warn_of
 from ballfg.dynamics.networks.architecture import MOST_DEPTH, MOST_WIDTH
 from ballfg.learning.trainee import TRAINEES
 from ballfg.machine import MOST_JOBS

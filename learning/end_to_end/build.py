@@ -10,7 +10,8 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics import BallModel
-from ballfg.dynamics.analytic import AnalyticModel, coefficient_sigmas
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import build as build_model
 from ballfg.dynamics.networks.spin_embedding import SPIN_UNIT, SpinEmbedding

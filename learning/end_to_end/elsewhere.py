@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.model import BASE, BallModel
 from ballfg.dynamics.motion.paths import paths
 from ballfg.dynamics.networks.fading import ABROAD, Fading, states_before_contacts

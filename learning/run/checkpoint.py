@@ -12,7 +12,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ballfg.checks import one_line
-from ballfg.dynamics.earlier_names import todays_name
+from ballfg.dynamics.coefficient import todays_name
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder

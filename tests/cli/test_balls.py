@@ -8,7 +8,7 @@ import pytest
 
 from ballfg.cli.commands.live import _scene
 from ballfg.dynamics import nominal_model
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.known_balls import KNOWN_BALLS
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.simulation.balls import ball_kind

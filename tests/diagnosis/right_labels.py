@@ -23,8 +23,8 @@ from ballfg.diagnosis import check_labels, diagnose, fit_model, hold_out
 from ballfg.diagnosis.generic_test import LabelCheck
 from ballfg.diagnosis.search.process_noise import calibrated_model
 from ballfg.dynamics import nominal_model
-from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import MEASURED
 from ballfg.simulation import SimulationConfig

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import Architecture, build, nominal_model
-from ballfg.dynamics.earlier_names import todays_name
+from ballfg.dynamics.coefficient import todays_name
 from ballfg.estimation import ExtendedKalmanFilter, Settings, Smoother
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress

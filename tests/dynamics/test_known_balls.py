@@ -11,7 +11,7 @@ import torch
 
 import ballfg as bf
 from ballfg.dynamics import Surfaces, known_balls, nominal_model
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.known_balls import KNOWN_BALLS, _read_ball, known_ball
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.motion.rollout import advance, rollout

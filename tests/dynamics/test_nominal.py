@@ -7,7 +7,7 @@ import math
 import pytest
 
 from ballfg.dynamics import AnalyticModel, nominal_model
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.dynamics.nominal import air_coefficients, nominal_note
 from ballfg.tracks import TABLE_TENNIS, Ball

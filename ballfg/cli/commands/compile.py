@@ -32,11 +32,19 @@ def compile_ahead(
     """
     from ballfg.dynamics import load_model, nominal_model
     from ballfg.dynamics.compiled.kept import cache_folder
+    from ballfg.dynamics.compiled.kept_model import about_file, keep
     from ballfg.dynamics.known_balls import KNOWN_BALLS
+    from ballfg.dynamics.nominal import keep_nominal
 
     inputs.know_effects(effects_file)
     models: dict[str, BallModel] = {name: nominal_model(name) for name in KNOWN_BALLS}
-    models |= {str(path): load_model(path) for path in model or ()}
+    inertia = KNOWN_BALLS["table_tennis"].inertia_factor
+    files = {path: load_model(path, inertia_factor=inertia) for path in model or ()}
+    models |= {str(path): one for path, one in files.items()}
+    for known in KNOWN_BALLS.values():
+        keep_nominal(known.ball)
+    for path, one in files.items():
+        keep(about_file(path, None, inertia), one)
     parts = [part for one in models.values() for part in _parts(one)]
     parts.append(partial(_search, models["table_tennis"]))  # its code is the same for all balls
     for part in progress(parts, len(parts), "parts compiled"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg import progress
+from ballfg import deferred, progress
 from ballfg.cli import inputs
 from ballfg.interrupts import heeded
 from ballfg.progress import print_notes
@@ -156,9 +156,7 @@ def _scene(
         ball = inputs.open_model(data, model, named)
         surfaces, settings = dataset_surfaces(data), dataset_settings(data, ball)
     else:
-        import torch
-
-        torch.set_num_threads(1)
+        deferred.on_one_thread()
         ball, settings = inputs.model_alone(model, named)
         surfaces = Surfaces.table_tennis(0.0)
     if not ball.measures_plainly:

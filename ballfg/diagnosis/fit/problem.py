@@ -14,8 +14,7 @@ from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, predict, se
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System, by_track
 from ballfg.dynamics import AnalyticModel, Coefficient
-from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
-from ballfg.dynamics.population import launch_axes as group_axes
+from ballfg.dynamics.population import SOFT_SPEED, launch_axes as group_axes
 from ballfg.dynamics.variation import Variation
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY

@@ -21,7 +21,7 @@ from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients, with_effec
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.dynamics import AnalyticModel, BallModel
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.dynamics.trained import Trained

@@ -5,9 +5,9 @@ import sys
 import threading
 import warnings
 import weakref
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cache, cached_property
+from collections.abc import Callable, Hashable
+from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -17,10 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.build import Code, built, digest, read_note, write_note
+from ballfg.dynamics.compiled.build import built, digest, read_note, write_note
 from ballfg.dynamics.compiled.flight import fly_together
 from ballfg.dynamics.compiled.kept import source_stamp
-from ballfg.dynamics.compiled.places import Numbers, numbers_of, stamp_of
+from ballfg.dynamics.compiled.kept_model import NONE, CompiledModel, Function, KeptModel
+from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.motion.flight_step import step_jacobian
@@ -35,63 +36,6 @@ VERSIONS: Final = f"torch {torch.__version__}, numba {numba.__version__}"
 COMPARED: Final = 4  # Number of random states at which both are computed
 
 
-@dataclass(frozen=True)
-class Function:
-    """A compiled function of a state and some coefficients."""
-
-    compute: Code
-    """`compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,), tangents xt
-    (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d)."""
-    names: tuple[str, ...]  # of the p coefficients that the function uses, as in `model.named_parameters()`
-    size: int  # m
-    weigh: Recipe | None = None  # computes the weights from a model's tables; None if there are none
-    source: str = ""  # of `compute`; empty where torch computes
-    calls: Mapping[str, str] = field(default_factory=dict)  # sources of the functions that it calls, by their names
-
-
-@dataclass(frozen=True)
-class CompiledModel:
-    """The functions of a ball model."""
-
-    rates: Function  # of the velocity, then of the spin, (6,)
-    impact: Function  # state after an impact, (9,)
-    surface: Function  # offset of surfaces above their declared heights in m, and their slopes along x and y, (3,)
-    rolling: Function  # rates of a ball that rests on a surface, (6,)
-    radius: float  # m, of the ball
-
-    @cached_property
-    def parts(self) -> tuple[Function, Function, Function, Function]:
-        """Rates, impact, surface and rolling."""
-        return self.rates, self.impact, self.surface, self.rolling
-
-    @cached_property
-    def addresses(self) -> tuple[int, ...]:
-        """By which machine code takes them."""
-        return tuple(part.compute.address for part in self.parts)
-
-    @cached_property
-    def _weighed(self) -> bool:
-        """True if any of them has weights."""
-        return any(part.weigh is not None for part in self.parts)
-
-    def weights(self, model: BallModel) -> tuple[Array, ...]:
-        """Weights of the `parts` from a model's present tables."""
-        if not self._weighed:
-            return (NONE,) * len(self.parts)
-        tables = numbers_of(model).tables()
-        now, known = stamp_of(tables), _weights.get(model)
-        if known is None or known[0] != now:
-            plain = [table.detach() for table in tables]
-            found = tuple(NONE if p.weigh is None else p.weigh(*plain).numpy() for p in self.parts)
-            known = _weights[model] = (now, tables, found)
-        return known[2]
-
-
-NONE: Final = np.zeros(0)  # The weights of a function without tables
-_Weighed = tuple[Hashable, Sequence[Tensor], tuple[Array, ...]]
-"""Stamp of a model's tables; these, kept so that no others get their place in memory and with it their stamp; the
-weights of its functions that were computed from them."""
-_weights: weakref.WeakKeyDictionary[BallModel, _Weighed] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """Attributes of every module; its parameters, buffers and parts are compared by themselves."""
 _BESIDE: Final = frozenset(
@@ -128,6 +72,8 @@ def compiled(model: BallModel) -> CompiledModel | None:
 
     Args: model: without substituted parameters. After an exchange of a module it gets other functions.
     """
+    if type(model) is KeptModel:
+        return compiled(model.whole)
     known = _by_model.get(model)
     if known is not None and known[0] is numbers_of(model):
         return known[1]
@@ -233,7 +179,7 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
         weigh = None if kept["weights"] is None else Recipe(**kept["weights"])
         made = Function(built(kept["source"]), tuple(kept["names"]), kept["size"], weigh, kept["source"])
         try:
-            if not _is_of_package(model):
+            if not is_of_package(model):
                 _compare(model, function, made)
         except NotTheSameError:  # its source has changed since
             pass
@@ -266,7 +212,7 @@ def _on_ground(model: BallModel, rates: Function) -> Function:
     built(source)
     calls = {"rates": rates.source, "ground": source}
     made = Function(built(ON_GROUND, calls), rates.names, rates.size, rates.weigh, ON_GROUND, calls)
-    if kept is None or not _is_of_package(model):
+    if kept is None or not is_of_package(model):
         _compare(model, _rolling, made)
     return made
 
@@ -299,7 +245,7 @@ def _files_of(model: BallModel) -> str | None:
     return ",".join(sorted(found))
 
 
-def _is_of_package(model: BallModel) -> bool:
+def is_of_package(model: BallModel) -> bool:
     """True if ballfg and torch define all parts of a model, and nobody has replaced a method of ballfg's since."""
     kinds = {type(part) for part in model.modules()}
     own = {kind for each in kinds for kind in each.__mro__ if kind.__module__.startswith("ballfg.")}
@@ -364,7 +310,7 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
 
 def _compare_steps_once(model: BallModel, made: CompiledModel, key: Hashable | None) -> None:
     """Compares a step unless a model of the package with the same sources agreed before. Raises: NotTheSameError."""
-    known = _about("steps", model, key) if _is_of_package(model) else None
+    known = _about("steps", model, key) if is_of_package(model) else None
     if known is None or read_note(known) is None:
         _compare_steps(model, made)
         if known is not None:

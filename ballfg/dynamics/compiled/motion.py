@@ -1,23 +1,26 @@
 """Moves batches of balls through flight and contacts in machine code, with Jacobians."""
 
+from __future__ import annotations
+
 import copy
 import threading
 import weakref
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.contacts import coefficients_of, contact_times, travel
-from ballfg.dynamics.compiled.functions import CompiledModel, compiled
 from ballfg.dynamics.compiled.ground import advance_one, roll_rows
+from ballfg.dynamics.compiled.kept_model import CompiledModel, KeptModel, carried
 from ballfg.dynamics.compiled.places import Numbers, numbers_of
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import MAX_CONTACTS, steps_over
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 RATES, IMPACT, SURFACE, ROLLING = range(4)  # The places of a model's functions in `CompiledModel.parts`
 
@@ -31,13 +34,13 @@ class Moving:
     """
 
     def __init__(self, model: BallModel, functions: CompiledModel, start: Array, width: int) -> None:
-        inner, names = (model.model, model.names) if isinstance(model, AugmentedModel) else (model, ())
+        inner, names = carried(model)
         self.functions, self.start, self.width = functions, np.ascontiguousarray(start, dtype=np.float64), width
         *self.addresses, self._rolling = functions.addresses
         *self.weights, self._rolling_weights = functions.weights(inner)
         self._own, self._places = _present(inner, functions, names)
 
-    def at(self, start: Array) -> "Moving":
+    def at(self, start: Array) -> Moving:
         """Other balls (n, 9 + p) of the model, with the coefficients that it had when these were made."""
         other = copy.copy(self)
         other.start = start
@@ -189,10 +192,22 @@ def functions_of(model: BallModel) -> CompiledModel | None:
     A subclass of `AugmentedModel` may compute anything, or draw random numbers: torch evaluates it, and coefficients
     by which machine code has no derivatives.
     """
-    if isinstance(model, AugmentedModel):
-        own = type(model) is AugmentedModel and numbers_of(model.model).scalars.keys() >= set(model.names)
-        return compiled(model.model) if own else None
-    return compiled(model)
+    inner, names = carried(model)
+    if inner is not model and type(model) is not KeptModel:
+        from ballfg.dynamics.augmented import AugmentedModel
+
+        if type(model) is not AugmentedModel or not numbers_of(inner).scalars.keys() >= set(names):
+            return None
+    return compiled(inner)
+
+
+def compiled(model: BallModel) -> CompiledModel | None:
+    """The functions of a model whose coefficients do not travel, as `functions.compiled` has them."""
+    if type(model) is KeptModel and "whole" not in vars(model):
+        return model.functions
+    from ballfg.dynamics.compiled.functions import compiled as made
+
+    return made(model)
 
 
 def world_of(surfaces: Surfaces, radius: float) -> Array:
@@ -211,7 +226,7 @@ def levels(count: int, heights: Sequence[Array | float] = ()) -> Array:
 
 def functions_for(model: BallModel) -> CompiledModel:
     """The functions of a model, whose coefficients may travel: machine code where there is any, else torch."""
-    inner = model.model if isinstance(model, AugmentedModel) else model
+    inner, _ = carried(model)
     if (functions := compiled(inner)) is not None:
         return functions
     from ballfg.dynamics.compiled.in_torch import in_torch

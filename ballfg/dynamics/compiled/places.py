@@ -1,14 +1,17 @@
 """Finds the coefficients and weights that a model passes to machine code, without a search at each call."""
 
+from __future__ import annotations
+
 import weakref
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
-from typing import Any, Final
+from operator import attrgetter, methodcaller
+from typing import TYPE_CHECKING, Any, Final
 
-from torch import Tensor
+if TYPE_CHECKING:
+    from torch import Tensor
 
-from ballfg.dynamics.model import BallModel
+    from ballfg.dynamics.model import BallModel
 
 
 @dataclass(frozen=True)
@@ -50,19 +53,20 @@ class Numbers:
 
 
 _VERSION: Final = attrgetter("_version")
+_ADDRESS: Final = methodcaller("data_ptr")
 
 
 def stamp_of(tables: Sequence[Tensor]) -> Hashable:
     """A number that changes with any of the tables, as long as those of an earlier stamp are kept alive."""
-    return tuple(map(id, tables)), tuple(map(_VERSION, tables)), tuple(map(Tensor.data_ptr, tables))
+    return tuple(map(id, tables)), tuple(map(_VERSION, tables)), tuple(map(_ADDRESS, tables))
 
 
-_numbers: weakref.WeakKeyDictionary[BallModel, Numbers] = weakref.WeakKeyDictionary()
+NUMBERS: Final[weakref.WeakKeyDictionary[BallModel, Numbers]] = weakref.WeakKeyDictionary()
 
 
 def numbers_of(model: BallModel) -> Numbers:
     """References to the numbers of a model. Args: model: without substituted parameters."""
-    known = _numbers.get(model)
+    known = NUMBERS.get(model)
     if known is None or not known.are_of(model):
         parameters, buffers = dict(model.named_parameters()), dict(model.named_buffers())
         places = {}
@@ -75,5 +79,5 @@ def numbers_of(model: BallModel) -> Numbers:
         arrays = {name: place for name, place in places.items() if name not in scalars}
         held = [part._modules for part in model.modules()]
         parts = [tuple(modules.values()) for modules in held]
-        known = _numbers[model] = Numbers(scalars, arrays, held, parts, (model.radius, model.inertia_factor))
+        known = NUMBERS[model] = Numbers(scalars, arrays, held, parts, (model.radius, model.inertia_factor))
     return known

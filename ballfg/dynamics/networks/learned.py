@@ -7,9 +7,10 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
+from ballfg.dynamics.coefficient import THIN_SHELL
 from ballfg.dynamics.effect import Coefficient, per_row
 from ballfg.dynamics.effects.bounce import TableHeight
-from ballfg.dynamics.model import BASE, THIN_SHELL, BallModel, Rates
+from ballfg.dynamics.model import BASE, BallModel, Rates
 from ballfg.dynamics.networks import gram_schmidt
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading

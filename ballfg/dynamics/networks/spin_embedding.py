@@ -13,11 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.checks import shown
+from ballfg.dynamics.population import SOFT_SPEED
 
 SPIN_UNIT: Final = 100.0  # rad/s for a weight of one, so that weights are of order one
-SOFT_SPEED: Final = 0.05
-"""m/s. Well below it a launch has no horizontal direction and its forward and across axes fade out; at 5 m/s they are
-5e-5 short of one."""
 
 
 class SpinEmbedding(nn.Module):

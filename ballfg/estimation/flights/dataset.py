@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.nominal import nominal_model
+from ballfg.dynamics.nominal import ready_nominal
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.flights.labels import FEWEST, SHORTEST, Labels, contrasts, label_samples, scatter
 from ballfg.estimation.result import Label
@@ -180,7 +180,7 @@ def in_flight(dataset: Dataset, most: int | None = None) -> InFlight:
 
     Args: dataset: of positions.  most: number of its first tracks that are looked at; None: all.
     """
-    physics = physics_of(nominal_model(dataset.ball))
+    physics = physics_of(ready_nominal(dataset.ball))
     levels = (dataset.table + dataset.ball.radius, dataset.ball.radius)
 
     def whole(track: Track, labels: Labels) -> bool:

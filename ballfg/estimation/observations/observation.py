@@ -4,6 +4,8 @@ Estimators know this interface only. A user's own kind of measurement is a subcl
 (docs/custom_factors.md); most are a `Reading`, which needs one function in torch.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,11 +13,9 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import check_each, shown
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.measurement.position_noise import MOST_SCATTER
 from ballfg.estimation.observations.innovation import leave_one_out, scatter
@@ -26,6 +26,9 @@ from ballfg.factors.linear.covariance import Covariances
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.model import BallModel
     from ballfg.estimation.result import Estimate
 
 
@@ -110,7 +113,7 @@ class Observation(ABC):
         Args: samples: (n,) bool, the selected samples of the track.
         """
 
-    def turned(self, rotation: Tensor, shift: Tensor) -> "Observation":
+    def turned(self, rotation: Tensor, shift: Tensor) -> Observation:
         """The same measurements in another frame: p -> rotation p + shift.
 
         Args: rotation: (3, 3) about the vertical, dimensionless.  shift: (3,) m.
@@ -139,7 +142,7 @@ class Observation(ABC):
         """
         return leave_one_out(rows, covariances)
 
-    def retimed(self, track: Track, estimate: "Estimate") -> Track | None:
+    def retimed(self, track: Track, estimate: Estimate) -> Track | None:
         """The track with stamps corrected by the unknowns; None, the default, if its stamps stay."""
         return None
 
@@ -165,7 +168,7 @@ class Observation(ABC):
         """Further factors that the start of a track needs; by default none."""
         return []
 
-    def judged(self, estimate: "Estimate") -> "Estimate":
+    def judged(self, estimate: Estimate) -> Estimate:
         """The estimate of its track, with a status that says what the observation leaves open.
 
         By default it gets a note where measurements, or those of one source, contradict each other and the motion by
@@ -182,11 +185,11 @@ class Observation(ABC):
         )
         return estimate if note in estimate.notes else replace(estimate, notes=(*estimate.notes, note))
 
-    def _parts(self, estimate: "Estimate") -> Mapping[str, float]:
+    def _parts(self, estimate: Estimate) -> Mapping[str, float]:
         """The same figure of each source of the measurements, by its name; by default of none."""
         return {}
 
-    def onto(self, old: Track, new: Track) -> "Observation":
+    def onto(self, old: Track, new: Track) -> Observation:
         """The same measurements on a track of the same ball with other stamps.
 
         Args: old: track of the observation.  new: track without it.
@@ -282,7 +285,7 @@ class GivenFactors(Observation):
         """The factors."""
         return self.factors
 
-    def select(self, samples: NDArray[np.bool_]) -> "GivenFactors":
+    def select(self, samples: NDArray[np.bool_]) -> GivenFactors:
         """The factors of some samples."""
         kept = self.factors.select(np.flatnonzero(samples[self.state]))
         kept.variables = kept.variables.copy()

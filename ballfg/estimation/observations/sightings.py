@@ -1,16 +1,17 @@
 """Holds the sightings of one ball by one or more cameras, and makes a track with rough positions from them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import ClassVar, Final, cast
+from typing import TYPE_CHECKING, ClassVar, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import listed, shown
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.bounced_code import LAWS
@@ -35,6 +36,9 @@ from ballfg.tracks.track import Label, Track
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_change import CHANGES
 from ballfg.vision.projection import CameraBank
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 TIME_OFFSET: Final = "time_offset."  # Prefix of the name of a camera's time offset among the unknowns of a track
 CHANGE: Final = "camera."
@@ -154,7 +158,7 @@ class CameraSightings(Observation):
         seen.moved = self.moved + offsets - self.time_offsets
         return again.observed(*(other.onto(track, again) for other in track.observations if other is not self))
 
-    def select(self, samples: NDArray[np.bool_]) -> "CameraSightings":
+    def select(self, samples: NDArray[np.bool_]) -> CameraSightings:
         """The sightings of some samples."""
         rows, number = samples[self.state], np.cumsum(samples) - 1
         sightings, state = self.sightings.select(rows), number[self.state[rows]]
@@ -180,7 +184,7 @@ class CameraSightings(Observation):
         own = CameraSightings(*arrays, one_view=True, bounces=found.contacts(track.times), place=place)
         return replace(self._in_place(track, own), positions=found.path.positions, sigmas=found.path.sigmas)
 
-    def _in_place(self, track: Track, other: "CameraSightings") -> Track:
+    def _in_place(self, track: Track, other: CameraSightings) -> Track:
         """The track with other sightings in place of these."""
         return replace(track, observations=tuple(other if one is self else one for one in track.observations))
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled.kept_model import carried
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.sides.gaussians import GaussianMixture
@@ -88,8 +89,8 @@ class FirstRest:
         mean, sigma = np.zeros(d), np.zeros(d)
         mean[POSITION], sigma[POSITION] = first.position, START_POSITION_SIGMA
         mean[VELOCITY] = (second.position - first.position) / (second.time - first.time)
-        if isinstance(self.model.ball, AugmentedModel):
-            mean[STATE_DIM:width] = self.model.ball.means().detach().numpy()
+        inner, names = carried(self.model.ball)
+        mean[STATE_DIM:width] = [numbers_of(inner).value(name) for name in names]
         sigma[VELOCITY], sigma[STATE_DIM:width] = settings.velocity_prior, [*settings.coefficients.values()]
         if self.model.biases:
             sigma[width:] = settings.memory

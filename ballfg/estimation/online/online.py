@@ -1,12 +1,14 @@
 """The online estimator updates a window of states by one observation at a time, with iSAM2 or the own solver."""
 
+from __future__ import annotations
+
 import copy
 import gc
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +25,6 @@ from ballfg.checks import (
     is_number,
     shown,
 )
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
@@ -51,6 +52,9 @@ from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 from ballfg.tracks.stamps import StreamOrigin
 from ballfg.vision.camera import Camera
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 LAG = 128
 """States that stay when the window is cut: 0.7 s at 180 Hz; new samples carry no information on older ones."""
@@ -144,7 +148,7 @@ class Online(Estimator):
         self._undirected: SpinLabel | None = None  # prior of the spin until the launch shows its direction
         self._newest: Newest | None = None  # of the window
 
-    def copy(self) -> "Online":
+    def copy(self) -> Online:
         """An independent estimator with the same observations.
 
         A copy from before a late sample lets a stream go back: the sample and its successors are pushed into the copy

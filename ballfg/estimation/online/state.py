@@ -1,5 +1,7 @@
 """Measurements and samples of a stream, and the belief after an update."""
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +11,6 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
-from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
@@ -25,6 +26,8 @@ from ballfg.tracks import Track
 if TYPE_CHECKING:
     import gtsam
 
+    from ballfg.dynamics.model import BallModel
+
 
 class Measurement:
     """One measurement of a state: a batch of one factor; `innovation` (dim,) whitened, NaN without a prediction."""
@@ -34,7 +37,7 @@ class Measurement:
         self.bridge = Bridge(batch, on_miss="row")
         self.innovation = np.full(batch.dim, np.nan)
 
-    def factor(self, state: int) -> "gtsam.CustomFactor":
+    def factor(self, state: int) -> gtsam.CustomFactor:
         """The factor on a state of the stream."""
         return self.bridge.factor(0, [state])
 

@@ -1,18 +1,23 @@
 """Derives the eight numbers of the segmentation's ball from the answers of any ball model."""
 
+from __future__ import annotations
+
 import math
 import weakref
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.kept_model import KeptModel
 from ballfg.dynamics.compiled.places import numbers_of
-from ballfg.dynamics.model import BallModel, is_substituted
 from ballfg.dynamics.motion.arrays import acceleration, bounced, surface_offsets
 from ballfg.state import STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 PROBE_SPEEDS = (2.0, 4.0, 8.0)
 """m/s, for the drag."""
@@ -87,7 +92,7 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
     Args: model: any `BallModel`; it is neither changed nor differentiated.
     """
     known = _known.get(model)
-    if known is None and is_substituted(model):
+    if known is None and _is_substituted(model):
         return _asked(model)
     numbers = numbers_of(model)
     stamp = numbers.stamp()
@@ -99,6 +104,14 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
 _known: weakref.WeakKeyDictionary[BallModel, tuple[Hashable, Sequence[Any], SegmentationPhysics]]
 _known = weakref.WeakKeyDictionary()
 """For each model: the stamp of its numbers, its tables, and the result."""
+
+
+def _is_substituted(model: BallModel) -> bool:
+    if type(model) is KeptModel:
+        return False
+    from ballfg.dynamics.model import is_substituted
+
+    return is_substituted(model)
 
 
 def _asked(model: BallModel) -> SegmentationPhysics:

@@ -6,10 +6,12 @@ of the contact; it is truncated where the ball would be below the surface. Frict
 sliding and rolling. So a bounce is computed for nine narrower Gaussians of the spin.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -17,7 +19,6 @@ from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.edges import height_below
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.compiled.motion import world_of
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.arrays import PreparedMotion, roll_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.observation import Observation
@@ -28,6 +29,9 @@ from ballfg.factors.correlated_noise import bias_step
 from ballfg.factors.dynamics import model_width
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 MOST_OFFSET: Final = 0.05
 """m. Upper bound on the rise of a surface by coefficients and slopes."""
@@ -239,12 +243,12 @@ class ContactHypotheses:
     nearest: float = 0.0
 
     @classmethod
-    def start(cls, model: HypothesisModel, mean: Array, covariance: Array) -> "ContactHypotheses":
+    def start(cls, model: HypothesisModel, mean: Array, covariance: Array) -> ContactHypotheses:
         """Hypotheses of a ball that has not bounced, with mean (d,) and covariance (d, d)."""
         flying = GaussianMixture.single(mean, covariance)
         return cls(model, flying, flying.selected(np.zeros(1, dtype=bool)), model.level(mean))
 
-    def step(self, dt: float, measured: SampleMeasurement) -> "ContactHypotheses":
+    def step(self, dt: float, measured: SampleMeasurement) -> ContactHypotheses:
         """The hypotheses dt s later, after a measurement."""
         weights = self._above.log_weights  # of the parts above the surface; the Gaussians stay whole
         still = replace(self.flying, log_weights=weights[:1])
@@ -257,7 +261,7 @@ class ContactHypotheses:
         bounced = GaussianMixture.concatenated([bouncing, flown.selected(~first)])
         return replace(self, flying=flown.selected(first), bounced=bounced).updated(measured)
 
-    def updated(self, measured: SampleMeasurement) -> "ContactHypotheses":
+    def updated(self, measured: SampleMeasurement) -> ContactHypotheses:
         """The hypotheses after a further measurement at the same stamp."""
         both, nearest = self.model.update(self._both, measured)
         first = np.arange(len(both)) == 0

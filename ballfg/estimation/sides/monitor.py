@@ -1,15 +1,16 @@
 """Finds samples near a contact or hit where a ball may be on either side, the states to report, and covariances."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.arrays import fly, fly_through, gap_jacobian
 from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Estimate
@@ -17,6 +18,9 @@ from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisModel, SampleMeasurement
 from ballfg.factors.linear.definite import compatible, definite, variances_positive
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 NEGLIGIBLE: Final = 1e-6
 """Probability below which a side is neglected."""

@@ -1,14 +1,16 @@
 """Lists the events of a track as motions from one sample to the next, and makes the dynamics factors of these."""
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import steps_over_each
 from ballfg.estimation.segmentation.result import Contact, Segmentation
 from ballfg.estimation.sides.monitor import across_hits
@@ -16,6 +18,9 @@ from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors, model_width
 from ballfg.factors.noise import Kicks, ProcessNoise
 from ballfg.state import VELOCITY
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,7 @@ class Motion:
     hit: bool = False
     linked: bool = True
 
-    def same(self, other: "Motion") -> bool:
+    def same(self, other: Motion) -> bool:
         """True if both have the same events, at any times."""
         mine = (self.heights, self.rest, self.hit, self.linked)
         return mine == (other.heights, other.rest, other.hit, other.linked)

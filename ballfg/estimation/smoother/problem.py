@@ -5,16 +5,18 @@ surface; a hit adds its jump to the process noise. An interval without a link (a
 Every observation of the track gives its factors; the first state of each linked piece gets a prior.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.augmented import AugmentedModel, augmented
+from ballfg.dynamics.compiled.kept_model import augmented
 from ballfg.dynamics.compiled.places import numbers_of
-from ballfg.dynamics.model import BallModel
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
@@ -33,6 +35,9 @@ from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 LEAST_SPIN_PRIOR = 60.0
 """rad/s, of a ball after a hit, however well a launcher repeats its spin."""
@@ -151,7 +156,7 @@ class TrackProblem:
             batches.append(BiasStartFactors(np.array([0]), sigma))
             batches.append(BiasFactors(np.arange(len(dt)), dt, sigma, self.settings.memory_time))
         own, others = self.coefficient_sigmas[: self.width], len(self.unknowns.names)
-        if isinstance(self.ball, AugmentedModel):
+        if self.width:
             batches.append(prior.CoefficientPriorFactors(self.ball, own, others))
         if others:
             batches.append(prior.coefficient_prior(self.unknowns.means, self.unknowns.sigmas, self.width))

@@ -8,6 +8,8 @@ search then ends in another minimum, or on a slope. In that case convex losses l
 search starts again; the lower minimum is the result.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +18,6 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.arrays import bounced, fly_through, gaps, surface_offsets
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
@@ -36,6 +37,7 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, 
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
     from ballfg.estimation.smoother.second_look.explanations import Depths
 
 ROUGH = 1e-2
@@ -69,9 +71,9 @@ class Solution:
     minimum: Minimum
     rival: Array | None = None
     """(3,) rad/s, first spin of another minimum that is nearly as low, if any."""
-    others: tuple["Other", ...] = ()
+    others: tuple[Other, ...] = ()
     """With other numbers of contacts in gaps, or before one camera, nearly as probable."""
-    depths: "Depths | None" = None
+    depths: Depths | None = None
     """Of a ball without contacts before one camera: its paths at all distances."""
 
 

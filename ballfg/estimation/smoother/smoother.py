@@ -1,15 +1,16 @@
 """The smoother finds the most probable states of a whole track by Levenberg-Marquardt on its factor graph."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import check_instance
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
@@ -49,6 +50,9 @@ from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 MAX_UNSEEN_HITS = 8
 """Largest number of hits that the estimate adds to the segmentation's; measured logs needed three at most."""
@@ -129,7 +133,7 @@ class Smoother(Estimator):
         """
         return None
 
-    def first_look(self) -> "Smoother":
+    def first_look(self) -> Smoother:
         """The smoother for stamps with errors of milliseconds.
 
         A flight then seems to be full of hits, which would absorb the offsets; and with wrong contacts no step reduces

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model, save_model
-from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.compiled import functions
 from ballfg.dynamics.compiled.functions import _rates, _traced
 from ballfg.dynamics.effects import generic, registry

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.effects.flight import Drag, Gravity
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.motion.integrate import fly

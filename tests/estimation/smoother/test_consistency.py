@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import EFFECTS
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ballfg.dynamics import nominal_model
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.estimation import Smoother
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.end_to_end.build import SPIN_PRIOR, _spin

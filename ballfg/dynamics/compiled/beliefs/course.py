@@ -1,8 +1,10 @@
 """Holds Gaussian beliefs of balls at a sequence of times and carries them on by machine code."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
@@ -13,9 +15,11 @@ from ballfg.dynamics.compiled.beliefs.mixture import mix
 from ballfg.dynamics.compiled.motion import Moving, functions_for, raise_errors, world_of
 from ballfg.dynamics.compiled.roll_out import crossed_by_all, scatter
 from ballfg.dynamics.compiled.signatures import GIVEN
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 ENDS: Final = slice(3, 7)  # Of a world for machine code: the ends of the table
 
@@ -38,7 +42,7 @@ class Course:
     age: Array
 
     @classmethod
-    def start(cls, mean: Array, covariance: Array) -> "Course":
+    def start(cls, mean: Array, covariance: Array) -> Course:
         """One time, without neighbours: mean (n, d), covariance (n, d, d)."""
         none = np.full((1, len(mean)), np.nan)
         return cls(mean[None], covariance[None], mean[None], covariance[None], none, none)
@@ -46,12 +50,12 @@ class Course:
     def __len__(self) -> int:
         return len(self.mean)
 
-    def at(self, rows: Any) -> "Course":
+    def at(self, rows: Any) -> Course:
         """A part of the times: a slice or indices."""
         return Course(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @staticmethod
-    def joined(parts: "Sequence[Course]") -> "Course":
+    def joined(parts: Sequence[Course]) -> Course:
         """All times of several courses."""
         if len(parts) == 1:
             return parts[0]

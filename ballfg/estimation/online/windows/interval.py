@@ -1,14 +1,16 @@
 """An interval is a dynamics factor between two samples; a filter predicts new states over it."""
 
+from __future__ import annotations
+
 import copy
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.flight import white_acceleration
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.limits import steps_over
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.factors.batch import merge
@@ -16,6 +18,9 @@ from ballfg.factors.bridge import Bridge, checked
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors, whiten
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 
 class Interval:

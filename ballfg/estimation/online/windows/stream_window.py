@@ -6,16 +6,17 @@ keep and solve the linear system: iSAM2 (`window.py`) or a chain of triangles (`
 docs/derivations/online.md explains the choices.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.model import BallModel
 from ballfg.estimation.online.state import Measurement, Sample, prepare
 from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.windows.window_filter import WindowFilter
@@ -26,6 +27,9 @@ from ballfg.factors.correlated_noise import BIAS_DIM, BiasedPositionFactors
 from ballfg.factors.dynamics import model_width
 from ballfg.factors.position import PositionFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,8 @@
 No sample beyond shows the side there.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -12,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.arrays import bounced, gap_jacobian, surface_offsets
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Quality, Rest
@@ -36,6 +37,7 @@ from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
     from ballfg.estimation.smoother.smoother import Smoother
 
 REACH: Final = 3
@@ -53,7 +55,7 @@ CERTAIN: Final = 1e-4  # Chance of the other side below which it widens nothing
 Solved = tuple[TrackProblem, Solution]
 
 
-def with_both_sides(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
+def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
     """The estimate; where it ends near a contact, its last state is that of the more probable side.
 
     It ends with the track, and before each gap over which nothing is known. The samples before the contact are
@@ -65,7 +67,7 @@ def with_both_sides(smoother: "Smoother", problem: TrackProblem, estimate: Estim
     return with_contact_states(estimate, states) if states else estimate
 
 
-def with_hit_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
+def with_hit_at_end(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
     """The estimate; where its last samples contradict the flight, their covariances hold that the ball may be struck.
 
     Segmentation and smoother need two or three samples after a hit to tell it from outliers.
@@ -98,7 +100,7 @@ def with_hit_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Estim
     return replace(estimate, covariances=covariances, cross_covariances=cross)
 
 
-def with_fall_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Estimate) -> Estimate:
+def with_fall_at_end(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
     """The estimate; where it ends while a ball rolls over an end of the table, its last state holds that it may fall.
 
     A fall shows late: 2 mm in 20 ms. So a ball that rolls and one that has left are followed from where it certainly
@@ -117,7 +119,7 @@ def with_fall_at_end(smoother: "Smoother", problem: TrackProblem, estimate: Esti
     return with_contact_states(estimate, {len(estimate) - 1: state})
 
 
-def _before_an_end(smoother: "Smoother", problem: TrackProblem, estimate: Estimate, rest: Rest) -> int | None:
+def _before_an_end(smoother: Smoother, problem: TrackProblem, estimate: Estimate, rest: Rest) -> int | None:
     """The last sample of a rest at which the ball is certainly on the table; None if it is there to the end.
 
     None too where the ball left the rest so long ago that the segmentation knows of it.
@@ -138,7 +140,7 @@ def _before_an_end(smoother: "Smoother", problem: TrackProblem, estimate: Estima
 
 
 def _fallen(
-    smoother: "Smoother", problem: TrackProblem, begin: int, level: float, quality: NDArray[np.int8]
+    smoother: Smoother, problem: TrackProblem, begin: int, level: float, quality: NDArray[np.int8]
 ) -> tuple[Array, Array] | None:
     """Mean and covariance of the last state and coefficients of a ball that rolls or falls; None if it hardly falls.
 
@@ -165,9 +167,7 @@ def _fallen(
     return near[0][:d], both[:d, :d]
 
 
-def _at_end(
-    smoother: "Smoother", problem: TrackProblem, estimate: Estimate, begin: int, end: int
-) -> ContactState | None:
+def _at_end(smoother: Smoother, problem: TrackProblem, estimate: Estimate, begin: int, end: int) -> ContactState | None:
     """The last state of the samples begin to end - 1, between which no restart lies; None if no contact is near."""
     track, model = problem.track, HypothesisModel(problem.ball, smoother.surfaces, problem.settings)
     intervals = [contact.interval for contact in estimate.contacts if contact.interval < end - 1]
@@ -205,7 +205,7 @@ def _before_contact(
     return None
 
 
-def _filtered(smoother: "Smoother", track: Track) -> tuple[Array, Array] | None:
+def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     """Mean and covariance of state, coefficients and bias at the end of a track; None if undetermined."""
     problem = smoother.problem(track)
     solution = smoother.settle(problem)
@@ -220,7 +220,7 @@ def _filtered(smoother: "Smoother", track: Track) -> tuple[Array, Array] | None:
     return mean, definite(known.joint(-1)[np.ix_(order, order)])
 
 
-def from_before_a_bounce(smoother: "Smoother", problem: TrackProblem, solution: Solution) -> Solved | None:
+def from_before_a_bounce(smoother: Smoother, problem: TrackProblem, solution: Solution) -> Solved | None:
     """The track with a contact right after its first sample, where there may be one; None for other tracks.
 
     The ball rises from a surface there. The later samples cannot show what was before, and the first one seems to be an
@@ -248,7 +248,7 @@ def from_before_a_bounce(smoother: "Smoother", problem: TrackProblem, solution: 
 
 
 def _before_contact_at_start(
-    smoother: "Smoother", problem: TrackProblem, solution: Solution
+    smoother: Smoother, problem: TrackProblem, solution: Solution
 ) -> tuple[Contact, Values] | None:
     """A contact right after the first sample and values from before it; None where the ball does not rise from one."""
     values, times = solution.minimum.values, problem.track.times
@@ -285,7 +285,7 @@ def _velocity_before(ball: BallModel, coefficients: Array, after: Array) -> Arra
     return before[0, VELOCITY]
 
 
-def _sigma_at_start(smoother: "Smoother", problem: TrackProblem, solution: Solution, slope: Array) -> float:
+def _sigma_at_start(smoother: Smoother, problem: TrackProblem, solution: Solution, slope: Array) -> float:
     """m, standard deviation of the gap at the first sample; slope: (9 + p,) derivatives by state and coefficients."""
     known = smoother.optimizer.covariances(solution.graph, solution.minimum)
     if known is None:

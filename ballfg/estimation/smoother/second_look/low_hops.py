@@ -5,17 +5,18 @@ certain. For such low hops, `HopGrid` follows all arrangements at once. It gives
 intervals, and the distance of the ball from the estimate, which holds one arrangement.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, median
-from ballfg.dynamics.augmented import augmented
+from ballfg.dynamics.compiled.kept_model import augmented
 from ballfg.dynamics.compiled.places import numbers_of
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.arrays import acceleration, bounced, gaps
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
@@ -26,6 +27,9 @@ from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.second_look.hop_grid import HopGrid, HopLaw, HopMoments, averaged
 from ballfg.state import POSITION, STATE_DIM, VZ, Z
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 LOW: Final = 10.0
 """Standard deviations of the noise. The segmentation distinguishes the bounces of higher hops."""
@@ -68,7 +72,7 @@ class LowHops:
         """Its last sample."""
         return self.first + len(self.known.speed) - 1
 
-    def select(self, begin: int, end: int) -> "LowHops | None":
+    def select(self, begin: int, end: int) -> LowHops | None:
         """The part within samples begin to end - 1 of the track, renumbered from 0; None if empty."""
         first, last = max(self.first, begin), min(self.last, end - 1)
         inside = slice(first - self.first, last + 1 - self.first)

@@ -8,13 +8,15 @@ A search of a whole long chain for every bounce would take a time that grows wit
 samples around a bounce decide first, and only spins that are clearly worse there are skipped.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.arrays import bounced
 from ballfg.estimation.smoother.settle import Solution
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
@@ -22,6 +24,9 @@ from ballfg.factors.dynamics import model_width
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
 from ballfg.factors.prior import PriorFactors, spin_prior
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 SLIDES = 0.05
 """Slope of log(friction) by log(slip): 0 while the ball slides, 1 once it grips, with a gradual transition."""
