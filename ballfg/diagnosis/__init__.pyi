@@ -11,6 +11,6 @@ from .residual_tests.label_check import check_labels as check_labels
 from .residual_tests.residuals import residuals_of as residuals_of
 from .residual_tests.sparse import sparse_terms as sparse_terms
 from .result import Diagnosis as Diagnosis
-from .search.candidates import score_all as score_all
 from .search.evaluation import prediction_errors as prediction_errors
 from .search.refits import refit as refit
+from .search.trial import score_all as score_all

@@ -20,8 +20,7 @@ from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.diagnosis.residual_tests.sparse import fallback
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, Unexplained, Value, Verdict
-from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
-from ballfg.diagnosis.search.process_noise import (
+from ballfg.diagnosis.search.evaluation import (
     calibrated_model,
     errors_of,
     has_population,
@@ -30,6 +29,7 @@ from ballfg.diagnosis.search.process_noise import (
     predictive_model,
     unpopulated_model,
 )
+from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
 from ballfg.diagnosis.search.ranking import at_bound, implausible
 from ballfg.diagnosis.search.stamp_effects import (
     as_declared,

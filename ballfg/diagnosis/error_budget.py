@@ -10,8 +10,7 @@ from torch import Tensor
 from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, analytic, hold_out
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
-from ballfg.diagnosis.search.evaluation import LEAST_PREDICTED, OBSERVED
-from ballfg.diagnosis.search.process_noise import errors_of, noise_about, predictive_model
+from ballfg.diagnosis.search.evaluation import LEAST_PREDICTED, OBSERVED, errors_of, noise_about, predictive_model
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, with_errors_of_counting
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Settings, dataset_settings

@@ -29,8 +29,8 @@ from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test
 from ballfg.diagnosis.residual_tests.label_check import judged, label_evidence, label_test
 from ballfg.diagnosis.result import Diagnosis, Errors, Finding
+from ballfg.diagnosis.search.evaluation import calibrated_model, errors_of, fitted_model, noise_about
 from ballfg.diagnosis.search.loop import NAMED, SearchLoop
-from ballfg.diagnosis.search.process_noise import calibrated_model, errors_of, fitted_model, noise_about
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.tracks import Dataset

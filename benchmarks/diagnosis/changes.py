@@ -12,7 +12,7 @@ from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
-from ballfg.diagnosis.search.process_noise import fitted_model
+from ballfg.diagnosis.search.evaluation import fitted_model
 from ballfg.dynamics import nominal_model, rollout
 from ballfg.dynamics.effects.flight import Wind
 from ballfg.dynamics.effects.measurement import FrameTilt, Scale, SpinLabelFrame, TimeScale

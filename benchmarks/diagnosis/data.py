@@ -17,7 +17,7 @@ from ballfg.diagnosis.fit.problem import Problem
 from ballfg.diagnosis.fit.stretches import Stretches, stretches_of
 from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects, without_effect
 from ballfg.diagnosis.result import Errors
-from ballfg.diagnosis.search.process_noise import errors_of, predictive_model
+from ballfg.diagnosis.search.evaluation import errors_of, predictive_model
 from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.dynamics.effect import Coefficient
 from ballfg.estimation import Smoother, dataset_settings

@@ -29,7 +29,7 @@ from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import stretches_of
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures, visible_directions
-from ballfg.diagnosis.search.candidates import ALARM
+from ballfg.diagnosis.search.score import ALARM
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
 
 LEVEL = ALARM  # False-alarm rate of the score tests of one round of the loop

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ballfg.diagnosis import check_labels, diagnose, fit_model, hold_out
 from ballfg.diagnosis.generic_test import LabelCheck
-from ballfg.diagnosis.search.process_noise import calibrated_model
+from ballfg.diagnosis.search.evaluation import calibrated_model
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.coefficient import coefficient_sigmas

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis import diagnose_jointly, write_report
-from ballfg.diagnosis.report.shots import median_shot
+from ballfg.diagnosis.report.predictions import median_shot
 from ballfg.dynamics import EFFECTS, load_model, nominal_model
 from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset, write_dataset

@@ -50,7 +50,7 @@ def diagnose(
     from ballfg.checks import check_range
     from ballfg.diagnosis import diagnose as find, diagnose_jointly
     from ballfg.diagnosis.one_view.diagnosis import diagnose_one_view
-    from ballfg.diagnosis.report.origin import Origin
+    from ballfg.diagnosis.report.headline import Origin
     from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, room_file, write_report
     from ballfg.dynamics import AnalyticModel
     from ballfg.estimation.observations.sighted_dataset import SightedDataset

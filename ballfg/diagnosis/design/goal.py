@@ -10,7 +10,7 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis, has_effect, hypotheses, scene_of
 from ballfg.diagnosis.report.report import REPORT
 from ballfg.diagnosis.result import Diagnosis
-from ballfg.diagnosis.search.candidates import score_all
+from ballfg.diagnosis.search.trial import score_all
 from ballfg.dynamics import EFFECTS
 from ballfg.files.json_file import read_json
 

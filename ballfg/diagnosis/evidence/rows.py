@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.diagnosis.fit.free_motion import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.patterns import blocks_of
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.response import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
 from ballfg.diagnosis.fit.stretches import of_similar_length
 from ballfg.state import SPIN, STATE_DIM
 

@@ -27,9 +27,9 @@ from ballfg.diagnosis.result import (
     Value,
     Verdict,
 )
-from ballfg.diagnosis.search.candidates import Scored
 from ballfg.diagnosis.search.loop import NAMED
 from ballfg.diagnosis.search.ranking import ranking, unusual
+from ballfg.diagnosis.search.score import Scored
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces
 from ballfg.dynamics.effect import Effect
 from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces

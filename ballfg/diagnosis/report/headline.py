@@ -4,6 +4,7 @@ import math
 import re
 import shlex
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +13,6 @@ import numpy as np
 from ballfg.diagnosis.fit.patterns import EVERYWHERE
 from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED
 from ballfg.diagnosis.report import wording
-from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.residual_tests.label_check import LABEL
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
@@ -35,6 +35,19 @@ SKEWED: Final = 1.5  # Ratio of the root mean square to the median track's error
 MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
 """Effects whose detectable size is in the first lines of a report without findings."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The inputs of a report, as the user typed them: command line, folders of the datasets, files."""
+
+    command: str
+    datasets: tuple[str, ...]
+    model: str  # the declared model's file; empty for the nominal model
+    out: str
+    models: tuple[str, ...] = ("model.yaml",)
+    """File of the corrected model of each dataset, in the folder `out` of the report."""
+    doubts: tuple[str, ...] = ()  # what is not sure about the tracks
 
 
 def answer(diagnosis: Diagnosis) -> str:

@@ -8,17 +8,17 @@ from matplotlib.figure import Figure
 from ballfg.diagnosis.generic_test import ALARM, percent
 from ballfg.diagnosis.report import pictures, wording
 from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
-from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
-from ballfg.diagnosis.report.origin import Origin, packages
+from ballfg.diagnosis.report.headline import Origin, advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.predictions import errors, one_shot, parts_of_error
 from ballfg.diagnosis.report.wording import glossary, term
 from ballfg.diagnosis.result import Diagnosis, Finding, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
-from ballfg.machine import date
+from ballfg.machine import date, versions
 from ballfg.pages.html import Html, doubtful, items, picture, section, table, tag, typed, whole_page
 
 BADGES = {Verdict.FOUND: "found", Verdict.NOTHING: "nothing", Verdict.UNEXPLAINED: "unexplained"}
 """CSS class of the verdict."""
+PACKAGES = ("ballfg", "torch", "numpy", "scipy")  # Those whose versions a report names
 
 
 def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
@@ -70,7 +70,8 @@ def _next(diagnosis: Diagnosis, origin: Origin | None) -> Iterator[Html]:
 
 def _made(diagnosis: Diagnosis, origin: Origin | None) -> Html:
     """Date, versions and inputs."""
-    rows = [("made on", date()), ("with", packages()), ("dataset", diagnosis.dataset)]
+    packages = ", ".join(f"{name} {version}" for name, version in versions(PACKAGES).items())
+    rows = [("made on", date()), ("with", packages), ("dataset", diagnosis.dataset)]
     if origin is not None:
         rows += [
             ("from", ", ".join(origin.datasets)),

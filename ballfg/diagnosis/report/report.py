@@ -13,8 +13,7 @@ import numpy as np
 
 from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.generic_test import LabelCheck
-from ballfg.diagnosis.report.headline import headline
-from ballfg.diagnosis.report.origin import Origin
+from ballfg.diagnosis.report.headline import Origin, headline
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
 from ballfg.dynamics import BallModel, save_model

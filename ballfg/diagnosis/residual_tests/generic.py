@@ -22,7 +22,7 @@ from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest
 from ballfg.diagnosis.hypotheses.signatures import signatures_of
 from ballfg.diagnosis.residual_tests.whiteness import whiteness
 from ballfg.diagnosis.result import Errors
-from ballfg.diagnosis.search.process_noise import MOST_FOR_NOISE
+from ballfg.diagnosis.search.evaluation import MOST_FOR_NOISE
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.tracks.noise import TrackNoise
 

@@ -18,7 +18,7 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.generic_test import GenericTest, LabelCheck, LabelVerdict
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.residual_tests.label_flights import LabelledFlight, labelled_flights
-from ballfg.diagnosis.search.process_noise import noise_about
+from ballfg.diagnosis.search.evaluation import noise_about
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings, Status, dataset_settings
 from ballfg.estimation.batch import estimate_tracks

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.free_motion import Piece, free_motion
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.response import Piece, free_motion
 from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
 from ballfg.state import STATE_DIM
 

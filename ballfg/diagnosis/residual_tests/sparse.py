@@ -17,7 +17,7 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures
 from ballfg.diagnosis.result import Errors, Fallback
-from ballfg.diagnosis.search.process_noise import next_shot_model, noise_about
+from ballfg.diagnosis.search.evaluation import next_shot_model, noise_about
 from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effects.registry import GENERIC

@@ -16,11 +16,10 @@ from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
-from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.changed_fits import smaller_fit, weighed_without
 from ballfg.diagnosis.search.evaluation import on_all, on_others
-from ballfg.diagnosis.search.models import WeighedModels
+from ballfg.diagnosis.search.models import WeighedModels, smaller_fit, weighed_without
 from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
+from ballfg.diagnosis.search.score import Scored
 from ballfg.diagnosis.search.trial import offered_varying, screen_of, try_hypotheses, try_varying
 from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all

@@ -9,8 +9,8 @@ from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.varying import Grouping
 from ballfg.diagnosis.result import Candidate, Errors, Finding
-from ballfg.diagnosis.search.changed_fits import with_strengths_of
 from ballfg.diagnosis.search.found import Found
+from ballfg.diagnosis.search.models import with_strengths_of
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings
 from ballfg.dynamics import AnalyticModel, BallModel

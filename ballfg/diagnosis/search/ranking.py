@@ -13,8 +13,8 @@ from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
-from ballfg.diagnosis.search.candidates import ALARM, Scored
 from ballfg.diagnosis.search.refits import Refit
+from ballfg.diagnosis.search.score import ALARM, Scored
 from ballfg.dynamics import EFFECTS
 from ballfg.dynamics.effect import Coefficient, Range
 from ballfg.tracks import TABLE_TENNIS

@@ -11,8 +11,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit, Problem
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
-from ballfg.diagnosis.search.candidates import ALARM, Scored
-from ballfg.diagnosis.search.score import Score
+from ballfg.diagnosis.search.score import ALARM, Score, Scored
 from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.state import SPIN
 

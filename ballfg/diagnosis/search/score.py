@@ -21,6 +21,8 @@ import numpy as np
 from scipy import optimize, stats
 
 from ballfg.arrays import Array, Index
+from ballfg.diagnosis.evidence.prior import log_odds
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import Efficient, Signatures, visible_directions
 
 PRIOR_TRACKS = 10.0
@@ -30,10 +32,11 @@ LEAST_OWN = 1e-6
 rounding in columns that were nearly projected out."""
 LEAST_KEPT = 0.05
 """Least remaining share of a track's score: a track that determines a direction alone cannot show its scatter."""
-
-
 NOTICED: Final = 0.9
 """Probability that an effect of the size `seen_from` passes the test."""
+ALARM = 0.0025
+"""Probability that a hypothesis passes the score tests of one round by chance. A trace that passes is about one whose
+effect is named."""
 LARGEST: Final = 1e4
 """Squared size, in units of its covariance, that any test detects."""
 
@@ -90,6 +93,32 @@ class Score:
         Args: alarm: significance level of the test.
         """
         return self.sigma * least_noticed(self.rank, self.tracks, alarm)
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A hypothesis and the outcome of its score test, corrected for the number of hypotheses; None: not visible.
+
+    `shapes` are the next best shapes of the effect: other places, other signs, possibly better minima.
+    `tested` is the number of hypotheses, `gain` the foretold logarithm of the ratio of evidences.
+    """
+
+    hypothesis: Hypothesis
+    score: Score | None
+    p_value: float
+    shapes: tuple[Hypothesis, ...] = ()
+    tested: int = 1
+    gain: float = -np.inf
+
+    @property
+    def explained(self) -> float:
+        """Squared whitened residual that the hypothesis would explain; negative if it is not visible."""
+        return -1.0 if self.score is None else self.score.explained
+
+    @property
+    def odds(self) -> float:
+        """Foretold logarithm of the posterior odds of the model with it to that without."""
+        return self.gain + log_odds([self.hypothesis])
 
 
 def score_tests(signatures: Signatures, candidates: Sequence[Sequence[int]]) -> list[Score | None]:

@@ -3,22 +3,91 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import takewhile
 from typing import cast
 
 import numpy as np
 
-from ballfg.diagnosis.evidence.rows import Motion, Patterns
+from ballfg.diagnosis.evidence.rows import Motion, Patterns, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
-from ballfg.diagnosis.hypotheses.signatures import columns_of
+from ballfg.diagnosis.hypotheses.signatures import columns_of, hypothesis_signatures
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
-from ballfg.diagnosis.search.candidates import Scored, leading_sets, score_all, screened, shortlist
 from ballfg.diagnosis.search.refits import Attempt, Refit, frame_hypotheses, refit, refit_driven, refit_set, refit_usual
+from ballfg.diagnosis.search.score import Scored, score_tests
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
+
+LEAST_GAIN = 0.0
+"""Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
+MOST_REFITS = 4
+"""Largest number of hypotheses that are refitted alone in a round."""
+MOST_SHAPES = 9
+"""Largest number of shapes of a hypothesis that are refitted."""
+PAIR = 2
+"""Number of hypotheses in the smallest set of several."""
+
+
+def score_all(
+    model: Weighed,
+    candidates: Sequence[Hypothesis],
+    motion: Motion | None = None,
+) -> list[Scored]:
+    """Score tests of all hypotheses, and their foretold gains.
+
+    Args:
+        model: without any of them, as `weigh` gives it.
+        candidates: the hypotheses; those without strengths are left out.
+        motion: random columns of the model's fit, if they are known.
+    Returns: the tests, sorted by explained residual, invisible hypotheses last.
+    """
+    testable = [h for h in candidates if h.strengths]
+    return screened(model, testable, random_motion(model.fit) if motion is None else motion)[0]
+
+
+def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> tuple[list[Scored], Screen]:
+    """The same of hypotheses with strengths, and what foretells the gains of sets of them.
+
+    Args: motion: random columns of the model's fit.
+    """
+    columns = columns_of(model.fit, testable)
+    screen = Screen.of(model, motion, testable, columns)
+    scores = score_tests(*hypothesis_signatures(model.fit, testable, columns))
+    scored = []
+    for hypothesis, score, gain in zip(testable, scores, screen.gains, strict=True):
+        p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
+        scored.append(Scored(hypothesis, score, p_value, tested=len(testable), gain=gain))
+    return sorted(scored, key=lambda s: s.explained, reverse=True), screen
+
+
+def shortlist(scored: Sequence[Scored]) -> list[Scored]:
+    """The hypotheses to refit: the best shapes of each effect that may gain.
+
+    Once one of them does, further shapes are worth a few steps even if nothing is foretold of them.
+    """
+    found: dict[str, list[Scored]] = {}
+    for candidate in sorted(scored, key=lambda s: s.gain, reverse=True):
+        if candidate.score is not None:
+            found.setdefault(candidate.hypothesis.name, []).append(candidate)
+    leading = [shapes for shapes in found.values() if shapes[0].gain > LEAST_GAIN][:MOST_REFITS]
+    return [replace(best, shapes=tuple(s.hypothesis for s in others[: MOST_SHAPES - 1])) for best, *others in leading]
+
+
+def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> dict[tuple[int, ...], float]:
+    """The most probable set of up to `most` visible hypotheses, and the most probable pair, with their log odds.
+
+    None that is foretold to be less probable than one hypothesis alone.
+    """
+    seen = {id(s.hypothesis) for s in scored if s.score is not None}
+    visible = [one for one, candidate in enumerate(screen.candidates) if id(candidate) in seen]
+    sets = screen.sets(visible, most)
+    likely = list(takewhile(lambda chosen: len(chosen) >= PAIR, sets))
+    pairs = [chosen for chosen in likely if len(chosen) == PAIR]
+    return {chosen: sets[chosen] for chosen in (*likely[:1], *pairs[:1])}
+
 
 AS_GOOD = 0.97
 """Share of the best place's explained residual from which another place of a change is as good."""

@@ -13,8 +13,8 @@ from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import weighed
 from ballfg.diagnosis.fit.free import Deviation
 from ballfg.diagnosis.hypotheses.hypothesis import hypotheses, scene_of
-from ballfg.diagnosis.search.candidates import Scored
 from ballfg.diagnosis.search.refits import refit
+from ballfg.diagnosis.search.score import Scored
 from ballfg.dynamics import EFFECTS
 from ballfg.state import SPIN, VELOCITY
 

@@ -17,8 +17,8 @@ from ballfg.diagnosis.evidence.weighed import Weight, weigh
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import columns_of
-from ballfg.diagnosis.search.candidates import Scored
 from ballfg.diagnosis.search.refits import refit
+from ballfg.diagnosis.search.score import Scored
 from ballfg.dynamics import EFFECTS
 
 WIND = Hypothesis(EFFECTS["wind"], {}, ("x", "y", "z"))

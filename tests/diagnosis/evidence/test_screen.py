@@ -20,8 +20,9 @@ from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.hypotheses.hypothesis import hypotheses, scene_of
 from ballfg.diagnosis.hypotheses.signatures import columns_of
-from ballfg.diagnosis.search.candidates import Scored, leading_sets, score_all, screened
 from ballfg.diagnosis.search.refits import refit, refit_set
+from ballfg.diagnosis.search.score import Scored
+from ballfg.diagnosis.search.trial import leading_sets, score_all, screened
 from ballfg.dynamics import EFFECTS
 
 CATALOGUE = [EFFECTS[name] for name in ("wind", "drag_speed", "restitution_speed", "frame_tilt")]

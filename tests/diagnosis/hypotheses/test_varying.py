@@ -16,10 +16,10 @@ from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_columns
 from ballfg.diagnosis.hypotheses.varying import Varying, groupings, near, varying_hypotheses
-from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.changed_fits import without_named
+from ballfg.diagnosis.search.models import without_named
 from ballfg.diagnosis.search.ranking import fitted_values
 from ballfg.diagnosis.search.refits import refit
+from ballfg.diagnosis.search.score import Scored
 from ballfg.diagnosis.search.trial import try_varying
 from ballfg.dynamics import EFFECTS, Scene
 from ballfg.dynamics.variation import Variation

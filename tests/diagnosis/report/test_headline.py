@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis.generic_test import GenericTest, LabelCheck, LabelVerdict
-from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
-from ballfg.diagnosis.report.origin import Origin
+from ballfg.diagnosis.report.headline import Origin, advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.report.pictures import beyond_histogram
-from ballfg.diagnosis.report.predictions import meaning
+from ballfg.diagnosis.report.predictions import distances, error_map, meaning, median_shot
 from ballfg.diagnosis.report.report import content
-from ballfg.diagnosis.report.shots import distances, error_map, median_shot
 from ballfg.diagnosis.report.wording import OF_A_TRACKER, OUTCOMES, TERMS, in_plain_words, plain_name
 from ballfg.diagnosis.residual_tests.label_check import label_test
 from ballfg.diagnosis.result import Diagnosis, Outcome, Unexplained, Value, Verdict

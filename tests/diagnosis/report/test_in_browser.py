@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballfg.diagnosis.report.origin import Origin
+from ballfg.diagnosis.report.headline import Origin
 from ballfg.diagnosis.report.page import page
 from ballfg.pages.html import DPI
 from tests.browser import needs_browser, opened

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.binned import binned, in_flight, motion_axes, slip_speed, turned
-from ballfg.diagnosis.report.shots import ShotErrors, error_map, shot_picture
+from ballfg.diagnosis.report.predictions import ShotErrors, error_map, shot_picture
 from ballfg.diagnosis.report.wording import change, fixed, joined, listed, number, plus_minus, probability
 from ballfg.diagnosis.result import Errors, PredictedPath, Value
 from tests.diagnosis.made_diagnosis import WIND, errors, found, residuals, rounds

@@ -12,8 +12,7 @@ import pytest
 
 from ballfg.diagnosis.budget import PARTS
 from ballfg.diagnosis.report import report
-from ballfg.diagnosis.report.headline import headline
-from ballfg.diagnosis.report.origin import Origin
+from ballfg.diagnosis.report.headline import Origin, headline
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.report.report import content, write_report
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.fit.free_motion import ACCELERATION, BIN
-from ballfg.diagnosis.fit.response import fitted_path, responses, weighted
+from ballfg.diagnosis.fit.response import ACCELERATION, BIN, fitted_path, responses, weighted
 from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_columns

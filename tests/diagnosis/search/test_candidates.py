@@ -15,18 +15,9 @@ from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, without_effect
-from ballfg.diagnosis.search.candidates import (
-    ALARM,
-    LEAST_GAIN,
-    MOST_REFITS,
-    Scored,
-    leading_sets,
-    score_all,
-    screened,
-    shortlist,
-)
 from ballfg.diagnosis.search.refits import FRAMES_FITTED, frame_hypotheses, refit, refit_driven
-from ballfg.diagnosis.search.score import Score
+from ballfg.diagnosis.search.score import ALARM, Score, Scored
+from ballfg.diagnosis.search.trial import LEAST_GAIN, MOST_REFITS, leading_sets, score_all, screened, shortlist
 from ballfg.dynamics import EFFECTS
 from ballfg.dynamics.effects.measurement import SpinLabelFrame, signed_permutations
 

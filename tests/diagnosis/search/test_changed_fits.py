@@ -8,9 +8,9 @@ from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import weigh, weighed
 from ballfg.diagnosis.hypotheses.hypothesis import hypotheses, scene_of
-from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.changed_fits import smaller_fit, weighed_without, without_named
+from ballfg.diagnosis.search.models import smaller_fit, weighed_without, without_named
 from ballfg.diagnosis.search.refits import refit
+from ballfg.diagnosis.search.score import Scored
 from ballfg.dynamics import EFFECTS
 
 

@@ -15,11 +15,11 @@ from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
 from ballfg.diagnosis.result import Errors, Outcome
-from ballfg.diagnosis.search.candidates import Scored
-from ballfg.diagnosis.search.changed_fits import with_strengths_of, without_at_shapes
 from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.loop import SearchLoop
+from ballfg.diagnosis.search.models import with_strengths_of, without_at_shapes
 from ballfg.diagnosis.search.refits import Attempt, refit
+from ballfg.diagnosis.search.score import Scored
 from ballfg.diagnosis.search.stamp_effects import first_fit
 from ballfg.diagnosis.search.trial import try_hypotheses
 from ballfg.dynamics import EFFECTS

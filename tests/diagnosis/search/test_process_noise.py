@@ -11,7 +11,7 @@ import torch
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import launch_axes
-from ballfg.diagnosis.search.process_noise import (
+from ballfg.diagnosis.search.evaluation import (
     calibrated_model,
     for_next_shot,
     has_population,
