@@ -44,10 +44,8 @@ from ballfg.dynamics.effect import Effect
 from ballfg.tracks import Dataset
 from ballfg.tracks.noise import TrackNoise
 
-MOSTLY = 0.1
-"""Share of the first pattern below which the found effects count as its explanation."""
-DESCRIBABLE = ("flight", "contact", "measurement")
-"""Tests of patterns that one model for all tracks can describe."""
+MOSTLY = 0.1  # Share of the first pattern below which the found effects count as its explanation
+DESCRIBABLE = ("flight", "contact", "measurement")  # Tests of patterns that one model for all tracks can describe
 
 
 def diagnose(

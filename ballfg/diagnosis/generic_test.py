@@ -5,14 +5,11 @@ from typing import Final
 
 import numpy as np
 
-ALARM: Final = 0.005
-"""Probability that any test of a complete fit raises an alarm: smaller p-values are alarms."""
+ALARM: Final = 0.005  # Probability that any test of a complete fit raises an alarm: smaller p-values are alarms
 
-APART: Final = "tracks"
-"""Name of the test for whiteness where nothing is left once each track has its own coefficients."""
+APART: Final = "tracks"  # Name of the test for whiteness where nothing is left once each track has its own coefficients
 
-PREDICTED: Final = "predictions"
-"""Name of the test of a model's noise on tracks that it was not fitted to."""
+PREDICTED: Final = "predictions"  # Name of the test of a model's noise on tracks that it was not fitted to
 
 
 @dataclass(frozen=True)
@@ -34,8 +31,7 @@ class GenericTest:
     share: float
 
 
-SURE: Final = 0.95
-"""Probability from which a label is reported as wrong."""
+SURE: Final = 0.95  # Probability from which a label is reported as wrong
 
 
 @dataclass(frozen=True)

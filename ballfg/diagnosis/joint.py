@@ -35,10 +35,8 @@ from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 from ballfg.tracks import Dataset
 
-ROOM: Final = "room"
-"""The label that identifies the rooms."""
-MOST_TRACKS: Final = 60
-"""Largest number of tracks per room, evenly spread: rooms must not wait for the largest of them."""
+ROOM: Final = "room"  # The label that identifies the rooms
+MOST_TRACKS: Final = 60  # Largest number of tracks per room, evenly spread: rooms must not wait for the largest of them
 
 
 @dataclass(frozen=True)

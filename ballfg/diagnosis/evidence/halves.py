@@ -14,13 +14,11 @@ from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.state import SPIN, VELOCITY
 
-LEAST_SHARE: Final = 0.25
-"""Of the tracks in the smaller half: a few shots teach too little about the others."""
+LEAST_SHARE: Final = 0.25  # Of the tracks in the smaller half: a few shots teach too little about the others
 LENGTH: Final = 0.5
 """s of flight at the usual speed, the distance between places of launch that counts as much as that speed does."""
 
-ALIKE: Final = 1e-9
-"""Shots that differ by less are equal: any halves will do."""
+ALIKE: Final = 1e-9  # Shots that differ by less are equal: any halves will do
 
 
 def unlike_halves(fit: Fit) -> Mask:

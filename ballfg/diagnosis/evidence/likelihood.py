@@ -18,12 +18,9 @@ from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
 
-ROUNDED: Final = 1e-3
-"""Rounding of inner products from which a stretch is reduced by its rows themselves."""
-LOST: Final = -1e6
-"""Logarithm of the density of a track under a model that rounding alone decides about."""
-Weights = tuple[Array, Array, Array]
-"""Robust weights of samples (n, k) and spins (n,), and their cost (n,)."""
+ROUNDED: Final = 1e-3  # Rounding of inner products from which a stretch is reduced by its rows themselves
+LOST: Final = -1e6  # Logarithm of the density of a track under a model that rounding alone decides about
+Weights = tuple[Array, Array, Array]  # Robust weights of samples (n, k) and spins (n,), and their cost (n,)
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,8 @@ from scipy import special
 from ballfg.diagnosis.evidence.rows import NAMELESS
 from ballfg.diagnosis.evidence.weighed import Weighed, Weight
 
-ALIKE = 0.05
-"""Odds of another effect in an effect's place above which the two cannot be told apart."""
-SURELY = 2.0
-"""Standard errors by which the gain on the other half must fall short of the evidence to take its place."""
+ALIKE = 0.05  # Odds of another effect in an effect's place above which the two cannot be told apart
+SURELY = 2.0  # Standard errors by which the gain on the other half must fall short of the evidence to take its place
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,8 @@ from ballfg.dynamics import AnalyticModel
 
 WIDTHS: Final = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Widths of the prior, in usual strengths, each as probable as the others."""
-THERE: Final = 0.05
-"""Prior probability that an effect of the catalogue is there: one or two of some thirty."""
-VARIES: Final = 0.01
-"""Prior probability that an effect differs between tracks in some way."""
+THERE: Final = 0.05  # Prior probability that an effect of the catalogue is there: one or two of some thirty
+VARIES: Final = 0.01  # Prior probability that an effect differs between tracks in some way
 
 
 def scales(hypothesis: Hypothesis) -> Array:
@@ -82,10 +80,8 @@ def _inside(low: Array, high: Array) -> Array:
 
 
 MIDDLE: Final = WIDTHS.index(1.0)
-HELD: Final = 1e-5
-"""Width of the prior of strengths that are held, in usual strengths."""
-WIDTH_ROUNDS: Final = 2
-"""Number of turns in which each effect gets its most probable width."""
+HELD: Final = 1e-5  # Width of the prior of strengths that are held, in usual strengths
+WIDTH_ROUNDS: Final = 2  # Number of turns in which each effect gets its most probable width
 
 
 @dataclass(frozen=True)

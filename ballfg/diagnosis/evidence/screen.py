@@ -21,16 +21,12 @@ from ballfg.diagnosis.evidence.rows import Motion, Patterns, batches_of, roots, 
 from ballfg.diagnosis.evidence.weighed import Strengths, Weighed, Weight
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
-TRIED: Final = tuple(range(0, len(WIDTHS), 2))
-"""Numbers of the widths that are tried: a screen needs no finer ones."""
-KEPT: Final = 6
-"""Number of the most probable sets of each size that are enlarged."""
+TRIED: Final = tuple(range(0, len(WIDTHS), 2))  # Numbers of the widths that are tried: a screen needs no finer ones
+KEPT: Final = 6  # Number of the most probable sets of each size that are enlarged
 
 
-Beside = tuple[tuple[int, int], ...]
-"""Numbers of candidates, each with that of its width."""
-Gone = tuple[int, ...]
-"""Places of the model's own effects with strengths that are left out."""
+Beside = tuple[tuple[int, int], ...]  # Numbers of candidates, each with that of its width
+Gone = tuple[int, ...]  # Places of the model's own effects with strengths that are left out
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,12 @@ from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Local, Noi
 from ballfg.diagnosis.evidence.rows import Rows
 from ballfg.state import STATE_DIM
 
-LEAST, MOST = -5.0, 5.0
-"""Bounds of the logarithm of a size over its unit."""
-MOST_STEPS, SETTLED = 30, 0.05
-"""Largest number of steps of the sizes, and the gain of evidence that ends them."""
+LEAST, MOST = -5.0, 5.0  # Bounds of the logarithm of a size over its unit
+MOST_STEPS, SETTLED = 30, 0.05  # Largest number of steps of the sizes, and the gain of evidence that ends them
 ENOUGH: Final = 0.05
 """Share of what a step of the common unknowns should gain that ends the sizes' steps too: it will change them."""
-LONGEST: Final = 1.5
-"""Largest step of the logarithm of a size."""
-Sized = tuple[Batches, Noise]
-"""A likelihood with the sizes of its noise."""
+LONGEST: Final = 1.5  # Largest step of the logarithm of a size
+Sized = tuple[Batches, Noise]  # A likelihood with the sizes of its noise
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,8 @@ from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
-MOST_STEPS = 12
-"""Largest number of steps from a deterministic fit to the most probable unknowns."""
-WORTH_A_STEP = 0.5
-"""Least expected gain of a step, natural units."""
+MOST_STEPS = 12  # Largest number of steps from a deterministic fit to the most probable unknowns
+WORTH_A_STEP = 0.5  # Least expected gain of a step, natural units
 
 
 @dataclass(frozen=True)

@@ -24,23 +24,15 @@ from ballfg.estimation import Settings
 from ballfg.state import SPIN, STATE_DIM
 from ballfg.tracks import Track
 
-MOST_STEPS = 15
-"""Largest number of Gauss-Newton steps in one minimisation."""
-CORRECTIONS = 2
-"""Number of corrections of first states that follow a step of all other unknowns."""
-SCALE_ROUNDS = 3
-"""Number of minimisations, each with new noise and weights."""
-SETTLED = 0.01
-"""Relative change of the noise below which it has converged."""
-TOLERANCE = 1e-5
-"""Relative decrease of the objective below which a minimisation ends."""
+MOST_STEPS = 15  # Largest number of Gauss-Newton steps in one minimisation
+CORRECTIONS = 2  # Number of corrections of first states that follow a step of all other unknowns
+SCALE_ROUNDS = 3  # Number of minimisations, each with new noise and weights
+SETTLED = 0.01  # Relative change of the noise below which it has converged
+TOLERANCE = 1e-5  # Relative decrease of the objective below which a minimisation ends
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e6
-NORMAL_MEDIAN = 0.6745
-"""Median of the absolute value of a standard normal number."""
-LEAST_SPREAD = 1e-3
-"""Share of the stated noise below which an axis counts as free of noise."""
-LEAST_SPIN_SCATTER = 1.0
-"""rad/s. Least scatter of unlabelled spins."""
+NORMAL_MEDIAN = 0.6745  # Median of the absolute value of a standard normal number
+LEAST_SPREAD = 1e-3  # Share of the stated noise below which an axis counts as free of noise
+LEAST_SPIN_SCATTER = 1.0  # rad/s. Least scatter of unlabelled spins
 
 
 def fit_model(

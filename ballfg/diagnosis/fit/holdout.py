@@ -25,8 +25,7 @@ LEAST_TRACKS = 6
 """Least number of tracks: with fewer, the search half has fewer than three, too few to measure the noise."""
 USUAL = {"flight.gravity.g": STANDARD_GRAVITY, "flight.drag.k": 0.12}
 """Gravity and drag by parameter name, for a model without them."""
-LAUNCHER_LABELS = ("topspin", "sidespin", "speed")
-"""Launcher settings that labels may hold as numbers."""
+LAUNCHER_LABELS = ("topspin", "sidespin", "speed")  # Launcher settings that labels may hold as numbers
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ PLAUSIBLE = {"flight": 1.0, "contact": 0.2, "measurement": 0.01}
 Names = tuple[str, ...]
 WORLD = ("along x", "along y", "vertically")
 OWN = ("along the flight", "across the flight", "along the lift")
-EVERYWHERE = "everywhere"
-"""The constant quantity."""
+EVERYWHERE = "everywhere"  # The constant quantity
 PLACE = ("place along x", "place along y", "height")
 SPINS = ("spin about the flight", "topspin", "sidespin")
 
@@ -41,10 +40,8 @@ CONTACT: tuple[tuple[Names, Names], ...] = (
 )
 MEASUREMENT = (PLACE, ("velocity along x", "velocity along y", "vertical velocity"))
 """Groups of quantities that are tested together; those of forces and kicks with the axes of the pattern."""
-DRIFT = "recording"
-"""Kind of the block of drift over a recording, as in reports."""
-LEAST_SCATTER = 1e-6
-"""In the unit of a quantity. Smaller scatter is rounding: all tracks have the same value."""
+DRIFT = "recording"  # Kind of the block of drift over a recording, as in reports
+LEAST_SCATTER = 1e-6  # In the unit of a quantity. Smaller scatter is rounding: all tracks have the same value
 
 
 @dataclass(frozen=True)

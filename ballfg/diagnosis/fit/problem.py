@@ -19,12 +19,9 @@ from ballfg.dynamics.variation import Variation
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
-POSITION_LOSS = Loss("huber", 3.0)
-"""Loss of a whitened position residual (three coordinates)."""
-LABEL_LOSS = Loss("cauchy", 3.0)
-"""Loss of a whitened spin label: some labels contradict the flight."""
-LAUNCHER_SPIN_SIGMA = 150.0
-"""rad/s, prior per axis, about zero, of the spin for a launcher setting of typical size."""
+POSITION_LOSS = Loss("huber", 3.0)  # Loss of a whitened position residual (three coordinates)
+LABEL_LOSS = Loss("cauchy", 3.0)  # Loss of a whitened spin label: some labels contradict the flight
+LAUNCHER_SPIN_SIGMA = 150.0  # rad/s, prior per axis, about zero, of the spin for a launcher setting of typical size
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,8 @@ from ballfg.state import STATE_DIM, VELOCITY
 if TYPE_CHECKING:
     from ballfg.diagnosis.fit.problem import Fit
 
-NODE = 0.01
-"""s. Spacing of the points at which forces act; a pattern of 1 m/s^2 is then right to 13 micrometres."""
-MOST_STRETCHES = 100
-"""Largest number of stretches in one pass; each takes about a megabyte."""
+NODE = 0.01  # s. Spacing of the points at which forces act; a pattern of 1 m/s^2 is then right to 13 micrometres
+MOST_STRETCHES = 100  # Largest number of stretches in one pass; each takes about a megabyte
 
 
 @dataclass(frozen=True)
@@ -192,13 +190,11 @@ def _dual_shot(
     return reached.primal[:, :m].transpose(0, 1).numpy(), by_first.numpy(), positions.numpy()
 
 
-BIN = 0.04
-"""s, approximate duration of a constant acceleration: no bin extends across a contact."""
+BIN = 0.04  # s, approximate duration of a constant acceleration: no bin extends across a contact
 ACCELERATION = 0.6
 """m/s^2/sqrt(Hz), prior density of a bin's white acceleration: 3 m/s^2 over 40 ms. A steady force then appears damped
 by a sixth to a third on arcs of 0.3 s. A wider prior damps less and shows more noise."""
-CONTACT_VELOCITY, CONTACT_SPIN = 0.2, 20.0
-"""m/s and rad/s, priors of the kicks after a contact, per axis."""
+CONTACT_VELOCITY, CONTACT_SPIN = 0.2, 20.0  # m/s and rad/s, priors of the kicks after a contact, per axis
 
 
 @dataclass(frozen=True)

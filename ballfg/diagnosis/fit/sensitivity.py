@@ -23,8 +23,7 @@ from ballfg.dynamics.model import substitute
 from ballfg.parallel.parts import in_parts
 from ballfg.state import SPIN, STATE_DIM
 
-MOST_ROWS = 3000
-"""Largest number of rows in one forward pass. A row needs some 50 kB of memory."""
+MOST_ROWS = 3000  # Largest number of rows in one forward pass. A row needs some 50 kB of memory
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ LONGEST_STEP, LONGEST_WAY = 0.04, 0.4
 """s and m of one integration step: twice those of a rollout below 20 m/s, the rollout's own above. A flight of a second
 then ends within a micrometre of the rollout's, far below the resolution of any camera. Steps become no shorter than a
 rollout's, however fast a state that a fit tries."""
-LEAST_ARC = 1e-3
-"""s. Least duration of an arc between two contacts for the choice of its steps."""
+LEAST_ARC = 1e-3  # s. Least duration of an arc between two contacts for the choice of its steps
 
 
 @dataclass(frozen=True)

@@ -16,32 +16,19 @@ from ballfg.arrays import Array, Index
 from ballfg.estimation.measurement.position_noise import FLOOR
 from ballfg.tracks import Track
 
-REGULAR: Final = 0.02
-"""Relative. Largest difference between the intervals of stamps that count frames."""
-NEAR: Final = 9
-"""Number of neighbouring steps that give the length of a step of one frame."""
-SHORT: Final = 25.0
-"""Percentile of these lengths that is first taken as one frame's."""
-MOST_MISSING: Final = 6
-"""Largest number of frames between two samples."""
-WINDOW: Final = 16
-"""Number of samples in a piece of flight for its polynomial."""
-ROUNDS: Final = 100
-"""Number of times that frames are counted again on a smoother motion."""
-CLEAR: Final = 0.7
-"""Largest ratio of a piece's variance with and without a further missing frame."""
-LEAST_SHARE: Final = 0.02
-"""Smallest share of missing frames at first."""
-TINY: Final = 1e-9
-"""m. Least step in a division."""
-QUIET: Final = 3.0
-"""Pieces whose scatter exceeds this multiple of the lower quartile hold a bounce or a hit."""
-SMOOTHER: Final = 0.5
-"""Least decrease of the log variance about polynomials for counted frames."""
-FAR: Final = 0.2
-"""Least error of a clock: the fit itself finds smaller ones, and a lift may look like one."""
-CHANCE: Final = 1e-3
-"""Significance level of wrong stamps in each half of the tracks."""
+REGULAR: Final = 0.02  # Relative. Largest difference between the intervals of stamps that count frames
+NEAR: Final = 9  # Number of neighbouring steps that give the length of a step of one frame
+SHORT: Final = 25.0  # Percentile of these lengths that is first taken as one frame's
+MOST_MISSING: Final = 6  # Largest number of frames between two samples
+WINDOW: Final = 16  # Number of samples in a piece of flight for its polynomial
+ROUNDS: Final = 100  # Number of times that frames are counted again on a smoother motion
+CLEAR: Final = 0.7  # Largest ratio of a piece's variance with and without a further missing frame
+LEAST_SHARE: Final = 0.02  # Smallest share of missing frames at first
+TINY: Final = 1e-9  # m. Least step in a division
+QUIET: Final = 3.0  # Pieces whose scatter exceeds this multiple of the lower quartile hold a bounce or a hit
+SMOOTHER: Final = 0.5  # Least decrease of the log variance about polynomials for counted frames
+FAR: Final = 0.2  # Least error of a clock: the fit itself finds smaller ones, and a lift may look like one
+CHANCE: Final = 1e-3  # Significance level of wrong stamps in each half of the tracks
 
 
 @dataclass(frozen=True)

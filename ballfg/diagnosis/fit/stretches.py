@@ -26,10 +26,8 @@ LEAST_SAMPLES = 10
 MOST_CONTACTS = 3
 """A stretch ends before the next contact: every further one costs as much as the first and makes the motion more
 sensitive to its start, while the last small hops of a ball carry little information."""
-LEAST_DURATION = 0.08
-"""s. A shorter stretch also carries little information."""
-SIMILAR = 1.3
-"""Ratio of the numbers of samples of stretches that are computed together."""
+LEAST_DURATION = 0.08  # s. A shorter stretch also carries little information
+SIMILAR = 1.3  # Ratio of the numbers of samples of stretches that are computed together
 TENSORS = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
 """Names of the tensors of `Stretches`."""
 PADDING = {"sigmas": math.inf, "heights": math.nan, "contacts": math.nan}

@@ -17,10 +17,8 @@ from ballfg.dynamics.effect import Effect, Scene, Vector
 
 TWINS: Mapping[str, tuple[str, ...]] = {"gravity": ("buoyancy",)}
 """Effects that are equivalent to another one in a model: the other one is listed for both."""
-LEAST_GAP = 1e-4
-"""s. Least distance of stamps for a speed."""
-AROUND = 0.1
-"""s to each side of a contact for the speed before it: offsets of time shift it."""
+LEAST_GAP = 1e-4  # s. Least distance of stamps for a speed
+AROUND = 0.1  # s to each side of a contact for the speed before it: offsets of time shift it
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,10 @@ from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.variation import TRACK, number_of, place_of
 from ballfg.tracks import Track
 
-MOST_GROUPS: Final = 8
-"""Largest number of values of a label that defines groups; a wheel speed or a player has more."""
+MOST_GROUPS: Final = 8  # Largest number of values of a label that defines groups; a wheel speed or a player has more
 LEAST_TRACKS: Final = 3
 """Least number of tracks on either side of a change, and in each group of either half, for their scatter."""
-PARTS: Final = 8
-"""Number of parts of a recording after which a change is first tested; its place is then refined."""
+PARTS: Final = 8  # Number of parts of a recording after which a change is first tested; its place is then refined
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from ballfg.estimation import Settings
 from ballfg.state import POSITION, VELOCITY, VZ
 from ballfg.tracks.track import Track
 
-LEAST: Final = 20
-"""Strokes. With fewer, the scatter of as many scores from stroke to stroke is hardly known."""
+LEAST: Final = 20  # Strokes. With fewer, the scatter of as many scores from stroke to stroke is hardly known
 REPEATS: Final = 3  # Times that each stroke is filmed again with the laws of today
 ROUNDS: Final = 4
 FOLLOWED, FOLLOWED_FROM, WORSE = 3, 12.0, 2.0

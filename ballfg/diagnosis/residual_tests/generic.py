@@ -30,8 +30,7 @@ TRACKS_PER_DIRECTION = 4
 """Number of tracks per tested direction of a block: their scatter must determine the directions' covariance."""
 LEAST_INFORMATION = 1.0
 """Least information of a tested direction: its strength is known to the size of a pattern large in practice."""
-MOST_SEEN = 95.0
-"""Percentile over the data in the words "up to"."""
+MOST_SEEN = 95.0  # Percentile over the data in the words "up to"
 
 
 @dataclass(frozen=True)

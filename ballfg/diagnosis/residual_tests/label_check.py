@@ -27,12 +27,10 @@ from ballfg.learning.calibration.coefficients import choose, values_of, with_val
 from ballfg.learning.calibration.population import evidence, fit_population
 from ballfg.tracks.noise import TrackNoise
 
-LABEL: Final = "label"
-"""Kind of the test."""
+LABEL: Final = "label"  # Kind of the test
 NONE_WRONG: Final = 0.5
 """Prior probability that all labels are right; else all shares of wrong ones are equally probable."""
-SHARES: Final = (np.arange(40) + 0.5) / 40
-"""Shares of wrong labels, the middles of fortieths."""
+SHARES: Final = (np.arange(40) + 0.5) / 40  # Shares of wrong labels, the middles of fortieths
 RIGHT: Final = np.exp(np.linspace(0.0, 1.4, 8))
 """Errors of right labels, as multiples of the stated ones: up to four times."""
 RIGHT_SPREAD: Final = 0.7
@@ -40,10 +38,8 @@ RIGHT_SPREAD: Final = 0.7
 WRONG: Final = np.exp(np.linspace(-1.1, 1.1, 9))
 """Errors of wrong labels, as multiples of `wrong_error`: a third to three times."""
 
-MOST_ROUNDS = 5
-"""Largest number of fits of the population; usual are three, from coefficients far off."""
-SETTLED = 0.1
-"""Change of the population's mean, in standard errors, below which it has converged."""
+MOST_ROUNDS = 5  # Largest number of fits of the population; usual are three, from coefficients far off
+SETTLED = 0.1  # Change of the population's mean, in standard errors, below which it has converged
 
 
 def check_labels(

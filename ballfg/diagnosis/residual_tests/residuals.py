@@ -16,8 +16,7 @@ from ballfg.diagnosis.fit.response import Piece, free_motion
 from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
 from ballfg.state import STATE_DIM
 
-_Row = tuple[Any, ...]
-"""A row of residuals: the number of the stretch, then the fields of its kind."""
+_Row = tuple[Any, ...]  # A row of residuals: the number of the stretch, then the fields of its kind
 
 
 def residuals_of(fit: Fit) -> Residuals:

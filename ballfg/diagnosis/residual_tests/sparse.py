@@ -24,12 +24,9 @@ from ballfg.dynamics.effects.registry import GENERIC
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.tracks import Dataset
 
-HELPS = 0.9
-"""Ratio of the prediction errors on the held-out half with and without an accepted fallback."""
-MOST_TERMS = 12
-"""Largest number of terms; more describe noise, and are unreadable."""
-LEAST_LEFT = 1e-6
-"""Least share of a term's information that is independent of the earlier terms."""
+HELPS = 0.9  # Ratio of the prediction errors on the held-out half with and without an accepted fallback
+MOST_TERMS = 12  # Largest number of terms; more describe noise, and are unreadable
+LEAST_LEFT = 1e-6  # Least share of a term's information that is independent of the earlier terms
 
 
 @dataclass(frozen=True)

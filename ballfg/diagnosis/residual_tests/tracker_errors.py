@@ -16,10 +16,8 @@ from ballfg.estimation.noise.estimate import linearised, spread_over
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, NUMBERS, TrackerPart, tracker_noise
 from ballfg.tracks.noise import TrackNoise
 
-MOST_TRACKS = 25
-"""Number of tested tracks of each half, evenly spread."""
-LONGEST_PART, MOST_SAMPLES = 1.0, 100
-"""s and samples of a tested track: computing time grows with them."""
+MOST_TRACKS = 25  # Number of tested tracks of each half, evenly spread
+LONGEST_PART, MOST_SAMPLES = 1.0, 100  # s and samples of a tested track: computing time grows with them
 SENTENCES = {
     MEMORY: "The tracker's errors last from sample to sample: a part of them fades over the memory's time.",
     JITTER: "Stamps err: each sample was taken a little before or after the moment that is written.",
@@ -28,8 +26,7 @@ DECIDE = {
     MEMORY: "Track a ball at rest, or one on a straight rail: its measured positions wander together for that time.",
     JITTER: "Film a clock, or take stamps from the camera's own exposures: they lie evenly where arrival times do not.",
 }
-UNITS = {MEMORY: "m", JITTER: "s"}
-"""Of `sigma`."""
+UNITS = {MEMORY: "m", JITTER: "s"}  # Of `sigma`
 
 
 @dataclass(frozen=True)

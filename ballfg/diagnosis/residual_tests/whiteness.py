@@ -21,12 +21,9 @@ from ballfg.tracks.noise import TrackNoise
 
 REACHES = (0.02, 0.06, 0.18)
 """s. Widths of the Gaussian kernels in the time between two samples: from a contact's duration to an arc's."""
-LEAST_WEIGHT = 0.5
-"""Samples with a smaller robust weight are outliers: their products carry no information on drift."""
-LEAST_SIZE = 1e-6
-"""Least relative size of a direction among the columns of a stretch: less is rounding."""
-LEAST_FREEDOM = 1e-6
-"""Least degrees of freedom of a stretch; one whose samples are all outliers has none."""
+LEAST_WEIGHT = 0.5  # Samples with a smaller robust weight are outliers: their products carry no information on drift
+LEAST_SIZE = 1e-6  # Least relative size of a direction among the columns of a stretch: less is rounding
+LEAST_FREEDOM = 1e-6  # Least degrees of freedom of a stretch; one whose samples are all outliers has none
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,8 @@ from ballfg.prediction.apexes import flight_bounds, measured_apexes, path_apex
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.noise import TrackNoise
 
-OBSERVED = 0.4
-"""Observed share of each track; the rest is predicted."""
-LEAST_PREDICTED = 3
-"""Least number of predicted samples."""
+OBSERVED = 0.4  # Observed share of each track; the rest is predicted
+LEAST_PREDICTED = 3  # Least number of predicted samples
 
 
 def prediction_errors(
@@ -127,10 +125,8 @@ def on_all(fitted: Fit, others: Fit) -> Fit:
     return fit_problem(replace(fitted.problem, stretches=stretches), unknowns, fitted.noise, settle_noise=False)
 
 
-MOST_FOR_NOISE = 25
-"""Number of tracks for the noise, evenly spread; more move no number by more than its error bar."""
-SPREAD = 0.3
-"""Prior median of the spread of coefficients between tracks, over the prior of an unfitted coefficient."""
+MOST_FOR_NOISE = 25  # Number of tracks for the noise, evenly spread; more move no number by more than its error bar
+SPREAD = 0.3  # Prior median of the spread of coefficients between tracks, over the prior of an unfitted coefficient
 
 
 def fitted_model(fit: Fit) -> AnalyticModel:

@@ -27,14 +27,11 @@ from ballfg.estimation.batch import do_all
 if TYPE_CHECKING:
     from ballfg.diagnosis.search.loop import SearchLoop
 
-MOST_EFFECTS = 5
-"""Largest number of added effects."""
-MOST_ROUNDS = 8
-"""Largest number of rounds: one adds several effects, or exchanges one."""
+MOST_EFFECTS = 5  # Largest number of added effects
+MOST_ROUNDS = 8  # Largest number of rounds: one adds several effects, or exchanges one
 AT_ONCE = 2
 """Number of attempts that are made side by side, whatever the number of processes: results do not depend on it."""
-MOST_EXCHANGES = 3
-"""Largest number of exchanges that a round refits."""
+MOST_EXCHANGES = 3  # Largest number of exchanges that a round refits
 
 
 @dataclass(frozen=True)

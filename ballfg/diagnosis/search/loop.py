@@ -16,8 +16,7 @@ from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 
-NAMED = 0.9
-"""Probability above which an effect is named."""
+NAMED = 0.9  # Probability above which an effect is named
 
 
 @dataclass(frozen=True)

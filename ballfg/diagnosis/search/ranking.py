@@ -122,12 +122,9 @@ def _row(scored: Scored, delta_bic: float | None, outcome: Outcome | None) -> Ca
     return Candidate(hypothesis.name, kind, estimate, score.explained, scored.p_value, delta_bic, outcome, least)
 
 
-NEAR: Final = 0.15
-"""Relative. Largest difference from the radius of a table-tennis ball, for these ranges to apply."""
-MARGIN: Final = 0.1
-"""Share of a range by which a fitted value may lie outside of it."""
-SIGMAS: Final = 3.0
-"""Largest distance of a plausible value from its range, in standard deviations of the value."""
+NEAR: Final = 0.15  # Relative. Largest difference from the radius of a table-tennis ball, for these ranges to apply
+MARGIN: Final = 0.1  # Share of a range by which a fitted value may lie outside of it
+SIGMAS: Final = 3.0  # Largest distance of a plausible value from its range, in standard deviations of the value
 
 
 def range_of(name: str, radius: float) -> Range | None:

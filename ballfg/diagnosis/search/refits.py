@@ -21,14 +21,10 @@ FIRST_STEPS, USUAL_STEPS = 2, 6
 They lead near the minimum of the deterministic fit, and the likelihood leads on from there. At that minimum itself a
 model that lacks something else has strengths that random motion does not need, often in the range of another maximum.
 """
-UNLABELLED_SPIN = 200.0
-"""rad/s, prior of a spin about zero without labels."""
-FRAMES = 48
-"""Number of exchanges and reversals of axes, including the identity."""
-FRAMES_FITTED = 2
-"""Number of frames that are fitted in full."""
-FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
-"""Cost of a label frame in BIC, for the choice among all frames."""
+UNLABELLED_SPIN = 200.0  # rad/s, prior of a spin about zero without labels
+FRAMES = 48  # Number of exchanges and reversals of axes, including the identity
+FRAMES_FITTED = 2  # Number of frames that are fitted in full
+FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))  # Cost of a label frame in BIC, for the choice among all frames
 
 
 @dataclass(frozen=True)

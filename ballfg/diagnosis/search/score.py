@@ -25,20 +25,17 @@ from ballfg.diagnosis.evidence.prior import log_odds
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import Efficient, Signatures, visible_directions
 
-PRIOR_TRACKS = 10.0
-"""Weight, in tracks, of the scatter pooled over all patterns, beside a pattern's own, uncertain one."""
+PRIOR_TRACKS = 10.0  # Weight, in tracks, of the scatter pooled over all patterns, beside a pattern's own, uncertain one
 LEAST_OWN = 1e-6
 """Least share of all information that a track has in every direction: it counts tracks without information, but not
 rounding in columns that were nearly projected out."""
 LEAST_KEPT = 0.05
 """Least remaining share of a track's score: a track that determines a direction alone cannot show its scatter."""
-NOTICED: Final = 0.9
-"""Probability that an effect of the size `seen_from` passes the test."""
+NOTICED: Final = 0.9  # Probability that an effect of the size `seen_from` passes the test
 ALARM = 0.0025
 """Probability that a hypothesis passes the score tests of one round by chance. A trace that passes is about one whose
 effect is named."""
-LARGEST: Final = 1e4
-"""Squared size, in units of its covariance, that any test detects."""
+LARGEST: Final = 1e4  # Squared size, in units of its covariance, that any test detects
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,10 @@ from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
 
-LEAST_GAIN = 0.0
-"""Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more."""
-MOST_REFITS = 4
-"""Largest number of hypotheses that are refitted alone in a round."""
-MOST_SHAPES = 9
-"""Largest number of shapes of a hypothesis that are refitted."""
-PAIR = 2
-"""Number of hypotheses in the smallest set of several."""
+LEAST_GAIN = 0.0  # Natural units. Least foretold gain of a candidate that is refitted: with new noise it may gain more
+MOST_REFITS = 4  # Largest number of hypotheses that are refitted alone in a round
+MOST_SHAPES = 9  # Largest number of shapes of a hypothesis that are refitted
+PAIR = 2  # Number of hypotheses in the smallest set of several
 
 
 def score_all(
@@ -89,10 +85,8 @@ def leading_sets(screen: Screen, scored: Sequence[Scored], most: int) -> dict[tu
     return {chosen: sets[chosen] for chosen in (*likely[:1], *pairs[:1])}
 
 
-AS_GOOD = 0.97
-"""Share of the best place's explained residual from which another place of a change is as good."""
-LABELLED = 0.5
-"""Share of flights with a spin label needed for a score test of an effect that multiplies spins."""
+AS_GOOD = 0.97  # Share of the best place's explained residual from which another place of a change is as good
+LABELLED = 0.5  # Share of flights with a spin label needed for a score test of an effect that multiplies spins
 
 
 def try_varying(
