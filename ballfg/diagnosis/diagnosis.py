@@ -173,26 +173,17 @@ def _labels(
 
 
 def _with_own_noise(
-    search: Search,
-    holdout: Holdout,
-    evaluate: Callable[[BallModel], Errors],
-    tell: Callable[[str], None],
-    jobs: int,
+    search: Search, holdout: Holdout, evaluate: Callable[[BallModel], Errors], tell: Callable[[str], None], jobs: int
 ) -> tuple[AnalyticModel, TrackNoise | None, Search]:
-    """The corrected model with its own noise, the tracker's noise if it is not white, and the updated search.
-
-    Errors of the declared model are those with the same tracker.
-    """
+    """The corrected model with its own noise, the tracker's if it is not white, and the search with that tracker."""
     declared, corrected = search.declared, search.predictive
     tell("looking at the tracker")
     tracker = look_at_tracker(corrected, holdout, jobs)
     if not tracker.findings:
         return corrected, tracker.noise, search
     tell(f"{' and '.join(finding.name for finding in tracker.findings)} found")
-    for model in (declared, corrected):
+    for model in dict.fromkeys((declared, corrected)):
         model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, tracker.noise, jobs=jobs)
-        if declared is corrected:
-            break
     search = replace(
         search,
         before=evaluate(as_declared(declared, holdout.stamps)),

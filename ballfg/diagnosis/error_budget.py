@@ -59,14 +59,10 @@ def error_budget(
 def budget_of(
     model: BallModel, holdout: Holdout, before_mm: float, after_mm: float, jobs: int = 1
 ) -> ErrorBudget | None:
-    """The budget of measured prediction errors.
+    """The budget of measured prediction errors; None if the model sees a hit in each track.
 
-    Args:
-        model: with the fitted noise and launcher.
-        holdout: the halves.
-        before_mm, after_mm: errors of the held-out half without the named effects, and with them.
-        jobs: processes.
-    Returns: None if the model sees a hit in each track.
+    Args: model: with the fitted noise and launcher.  before_mm, after_mm: of the held-out half, without the named
+        effects and with them.
     """
     settings = dataset_settings(holdout.dataset, model)
     expected = expected_squares(model, holdout.held_out_tracks, holdout.surfaces, settings, jobs)
@@ -78,10 +74,8 @@ def expected_squares(
 ) -> tuple[dict[str, float], int] | None:
     """Expected squared prediction errors by source, over the samples that `prediction_errors` counts.
 
-    The tracks are linearised about their estimates from all samples, and those in which the model sees a hit are left
-    out.
+    The tracks are linearised about their estimates from all samples; those in which the model sees a hit are left out.
 
-    Args: as of `prediction_errors`.
     Returns: mm^2, means over the predicted samples by name, and the number of tracks; None without any.
     """
     linear = linearised(model, surfaces, settings, [t.track for t in tracks], jobs=jobs)

@@ -1,8 +1,7 @@
 """Diagnoses several rooms together, with one ball for all, and rooms and rigs of their own.
 
 One fit holds the flights of all rooms. Coefficients of flight are shared; those of bounce and measurement have a value
-for each room, tied together by their priors. Effects of the ball are searched in all rooms together, and all effects in
-each room by itself. Effects common to all rooms belong to the ball and serve predictions in new rooms.
+for each room, tied together by their priors.
 """
 
 import copy
@@ -99,7 +98,7 @@ def diagnose_jointly(
     loop = SearchLoop(*asked, jobs=jobs, of_some=effects, ways=lambda searched: [way], name_at=name_at)
     search = loop.run(model, _first_fit(model, halves, way))
     tell("looking at what is left")
-    models = predicting.models(predicting(search.whole))
+    models = predicting.models[predicting(search.whole)]
     labels = _labels(rooms, models, model, jobs)
     of_labels = () if labels is None else (label_test(labels),)
     patterns = (test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
@@ -188,23 +187,19 @@ class _Predicting:
 
     def __init__(self, rooms: Sequence[Room], jobs: int) -> None:
         self.rooms, self.jobs = rooms, jobs
-        self._models: WeakKeyDictionary[BallModel, dict[str, AnalyticModel]] = WeakKeyDictionary()
+        self.models: WeakKeyDictionary[BallModel, dict[str, AnalyticModel]] = WeakKeyDictionary()
         self._judged: WeakKeyDictionary[BallModel, dict[str, Errors]] = WeakKeyDictionary()
 
     def __call__(self, fit: Fit) -> AnalyticModel:
         models = {room.name: self._model(fit, room) for room in self.rooms}
         model = with_effects(fit.problem.model)
-        self._models[model] = models
+        self.models[model] = models
         return model
-
-    def models(self, model: BallModel) -> dict[str, AnalyticModel]:
-        """The room models of a model from this class."""
-        return self._models[model]
 
     def judge(self, model: BallModel) -> Errors:
         """The errors on the judging halves of all rooms."""
         if model not in self._judged:
-            self._judged[model] = self._errors(self._models[model])
+            self._judged[model] = self._errors(self.models[model])
         return _pooled(self._judged[model])
 
     def errors_by_room(self, declared: BallModel, corrected: BallModel) -> list[str]:

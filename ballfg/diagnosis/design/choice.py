@@ -1,9 +1,7 @@
 """Chooses the shots that together determine the wanted coefficients best, among all combinations of given levels.
 
-The measure of a side of r strengths is log det C / 2 r, with C their covariance when all else is unknown: the log of
-its error bar, averaged over its directions. That is D_s-optimality, and c-optimality for a single coefficient. The
-measures of all sides are averaged. Shots are chosen greedily, then exchanged one by one while that lowers the measure,
-then sorted by their gain.
+They minimise the log of the error bar, averaged over all sides and their directions (docs/design_shots.md): greedily,
+then by exchanges one by one while that helps, then sorted by their gain.
 """
 
 import itertools

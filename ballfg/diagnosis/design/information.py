@@ -1,6 +1,5 @@
 """Predicts the flights of a launcher, and computes the information on coefficients in them and in a dataset."""
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +10,7 @@ from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.design.goal import Goal
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretches
+from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients
 from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
@@ -150,10 +150,7 @@ def information_of(fit: Fit, goal: Goal, starts: Array, settings: Array, surface
     unknowns = replace(fit.unknowns, values=values)
     units = 1.0 / np.sqrt(problem.common_precision)
     known = Fit.at(problem, unknowns, fit.noise).gram.sum(axis=0)[:-1, :-1]
-    fitted = copy.deepcopy(problem.model)
-    for name, parameter in fitted.named_parameters():
-        if name in values:
-            parameter.data.fill_(values[name])
+    fitted = with_coefficients(problem.model, values)
     flights, kept = planned_flights(fitted, starts, settings, surfaces, View.of(problem.stretches))
     parts, usable = [np.zeros((0, len(units), len(units)))], [np.zeros(0, dtype=np.bool_)]
     for first in range(0, len(flights), AT_ONCE):

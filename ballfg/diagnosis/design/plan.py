@@ -16,7 +16,7 @@ from ballfg.diagnosis.design.goal import separating, shrinking
 from ballfg.diagnosis.design.information import information_of
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, launch_axes
-from ballfg.diagnosis.search.evaluation import on_all, on_others
+from ballfg.diagnosis.search.evaluation import on_all
 from ballfg.diagnosis.search.stamp_effects import first_fit
 from ballfg.dynamics import AnalyticModel
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
@@ -176,7 +176,7 @@ def design_shots(
     names = tuple(levels)
     check_labels(dataset, names)
     holdout = hold_out(dataset, model, jobs, watch)
-    fit = _fit_of_all(model, holdout)
+    fit = on_all(first_fit(model, holdout), holdout.held_out)
     goal = separating(fit, between) if between else shrinking(fit, shrink)
     candidates, launcher = combinations(levels), _launcher(fit, holdout.tracks, names)
     starts, settings = launcher.states(candidates), _known_settings(holdout, fit, names, candidates)
@@ -211,12 +211,6 @@ def check_labels(dataset: Dataset, names: Sequence[str]) -> None:
                 f"candidates must be columns of the dataset's labels.csv; '{name}' is none of them, there are: "
                 f"{present}.{did_you_mean(name, dataset.label_names)} Name those that the launcher was set to."
             )
-
-
-def _fit_of_all(model: AnalyticModel, holdout: Holdout) -> Fit:
-    """The declared model fitted to the tracks of both halves."""
-    searched = first_fit(model, holdout)
-    return on_all(searched, on_others(searched, holdout.held_out))
 
 
 def _launcher(fit: Fit, tracks: Sequence[Track], names: tuple[str, ...]) -> LauncherMap:

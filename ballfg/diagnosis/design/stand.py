@@ -1,9 +1,8 @@
 """Tells where one camera should stand: how well it would know strokes from each of many places.
 
-The strokes are those of a dataset. From each place they are filmed without noise and estimated from these sightings
-alone; the standard deviations of such an estimate are those to expect there, since they hold. A sample that is
-out of the picture or behind the table counts as one of unbounded error: else the best place would be one that sees a
-small part of each stroke well, or through the table.
+From each place the strokes of a dataset are filmed without noise and estimated from these sightings alone. A sample
+that is out of the picture or behind the table counts as one of unbounded error: else the best place would see a small
+part of each stroke well, or through the table.
 """
 
 from collections.abc import Sequence

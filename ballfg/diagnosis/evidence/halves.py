@@ -1,8 +1,6 @@
 """Splits the tracks into two halves of unlike shots, of which each judges what the other one taught.
 
-Where shots repeat, halves that are alike repeat the errors of a wrong model too: whatever describes one half describes
-the other. An effect that is there acts on other shots as well, and gains there what it promises. One that only stands
-for missing physics at these speeds and spins does not.
+An effect that is there gains on other shots what it promises; what stands for missing physics at these shots does not.
 """
 
 from typing import Final

@@ -1,8 +1,6 @@
 """The marginal likelihood of the tracks under a model with noise: first states and random motion are integrated out.
 
-Sizes of the noise maximise it for each model, so that what a wrong model cannot explain counts as its noise. Common
-unknowns have their priors; with them integrated out too the likelihood is the evidence of the model, by Laplace's
-approximation.
+With the common unknowns integrated out too it is the evidence of the model, by Laplace's approximation.
 """
 
 from collections.abc import Sequence
@@ -231,14 +229,11 @@ class Batches:
     def reduced(self, noise: Noise) -> tuple[Reduced, list[Local]]:
         """First states and random motion integrated out, and what was eliminated in each batch."""
         if noise not in self._known:
-            self._known[noise] = self._reduced(noise)
+            parts, local = zip(*(part.reduced(noise) for part in self.parts), strict=True)
+            order = np.argsort(np.concatenate([part.rows.numbers for part in self.parts]))
+            arrays = (np.concatenate([getattr(r, name) for r in parts])[order] for name in ("constant", "gram"))
+            self._known[noise] = Reduced(*arrays), list(local)
         return self._known[noise]
-
-    def _reduced(self, noise: Noise) -> tuple[Reduced, list[Local]]:
-        found = [part.reduced(noise) for part in self.parts]
-        order = np.argsort(np.concatenate([part.rows.numbers for part in self.parts]))
-        constant, gram = (np.concatenate([getattr(r, name) for r, _ in found])[order] for name in ("constant", "gram"))
-        return Reduced(constant, gram), [local for _, local in found]
 
     def reweighted(self, noise: Noise) -> "Batches":
         """As of `Likelihood`."""

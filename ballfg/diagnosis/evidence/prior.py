@@ -1,7 +1,6 @@
 """Prior odds of effects, the heavy-tailed prior of their strengths, and the normal priors of all unknowns of a fit.
 
-A strength is normal about absence with a width that is itself unknown: some share or multiple of the effect's usual
-strength. A strength of five times the usual one so costs two nats, and no strength is forbidden.
+A strength is normal about absence with a width that is itself unknown, so that no strength is forbidden.
 """
 
 from collections.abc import Sequence

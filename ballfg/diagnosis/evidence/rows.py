@@ -1,11 +1,8 @@
 """Rows of a fit, with columns for the motion that its model cannot explain, and for patterns that no effect describes.
 
-A fit is deterministic: whatever the model lacks is in its residual. Here the same linearised rows get random columns
-beside the first states: white acceleration in short bins of flight, kicks of velocity and spin after contacts, and
-coefficients that scatter from track to track. Their sizes are the noise of the model.
-
-Under wrong physics the nearest effect explains a part, on both halves of the tracks. It is believed only if it explains
-more than smooth patterns of place, velocity, spin and time would, whose sizes are as free as its own.
+Random columns are white acceleration in short bins of flight, kicks after contacts, and coefficients that scatter from
+track to track; their sizes are the noise of the model. An effect is believed only if it explains more than smooth
+patterns of place, velocity, spin and time would, whose sizes are as free as its own.
 """
 
 from collections import defaultdict
@@ -149,12 +146,8 @@ class Rows:
 
 def rows_of(fit: Fit, motion: Motion) -> list[Rows]:
     """The rows of a fit at its minimum; motion: `random_motion` of this or a similar fit to the same samples."""
-    system, stretches, root, used = (
-        fit.linearised,
-        fit.problem.stretches,
-        roots(fit),
-        fit.problem.stretches.used.numpy(),
-    )
+    system, stretches, root = fit.linearised, fit.problem.stretches, roots(fit)
+    used = stretches.used.numpy()
     residual, by_start, by_common = system.residual / root[..., 0], system.by_start / root, system.by_common / root
     return [
         Rows(

@@ -26,6 +26,7 @@ KEPT: Final = 6  # Number of the most probable sets of each size that are enlarg
 
 
 Beside = tuple[tuple[int, int], ...]  # Numbers of candidates, each with that of its width
+_Odds = Mapping[tuple[int, ...], float]  # Logarithms, by the numbers of the candidates of a set
 Gone = tuple[int, ...]  # Places of the model's own effects with strengths that are left out
 
 
@@ -60,9 +61,7 @@ class Screen:
     ) -> "Screen":
         """The screen of a model.
 
-        Args:
-            motion: random columns of its fit.
-            columns: (n, m, p) of all strengths, as in the fit's system.
+        Args: motion: random columns of its fit.  columns: (n, m, p) of all strengths, as in the fit's system.
             patterns: without a name, that the model was weighed with.
         """
         stretches, strengths = model.fit.problem.stretches, columns / roots(model.fit)
@@ -116,14 +115,10 @@ class Screen:
                 for one in offered:
                     if self.candidates[one].name not in names and frozenset((*chosen, one)) not in known:
                         larger[*chosen, one] = self.odds((*chosen, one))
-            parts = {frozenset(c): o for c, o in found.items()}
-            gained = {c: o for c, o in larger.items() if o > max(parts.get(part, -np.inf) for part in _parts(c))}
-            best = self._leading(gained)
-            found |= {chosen: gained[chosen] for chosen in best}
-            known_scores = {frozenset(c): score for c, score in scores.items()}
-            more = self._borne_out(best, others)
-            best = [c for c in best if more[c] > max(known_scores.get(part, -np.inf) for part in _parts(c))]
-            scores |= {chosen: more[chosen] for chosen in best}
+            best = self._leading(_beyond_parts(larger, found))
+            found |= {chosen: larger[chosen] for chosen in best}
+            more = _beyond_parts(self._borne_out(best, others), scores)
+            best, scores = list(more), scores | more
         return dict(sorted(scores.items(), key=lambda item: -item[1]))
 
     def _borne_out(
@@ -206,12 +201,12 @@ class Screen:
     def _names(self, chosen: Sequence[int]) -> frozenset[str]:
         return self.model.names | {self.candidates[one].name for one in chosen}
 
-    def _leading(self, odds: Mapping[tuple[int, ...], float], most: int = KEPT) -> list[tuple[int, ...]]:
+    def _leading(self, odds: _Odds) -> list[tuple[int, ...]]:
         """The most probable sets, each with its candidates in their best shapes."""
         best: dict[frozenset[str], tuple[int, ...]] = {}
         for chosen in sorted(odds, key=lambda chosen: -odds[chosen]):
             best.setdefault(self._names(chosen), chosen)
-        return list(best.values())[:most]
+        return list(best.values())[:KEPT]
 
     @property
     def _own(self) -> int:
@@ -280,6 +275,7 @@ class _Gain:
     width: int
 
 
-def _parts(chosen: tuple[int, ...]) -> list[frozenset[int]]:
-    """The sets with one candidate less."""
-    return [frozenset(chosen[:place] + chosen[place + 1 :]) for place in range(len(chosen))]
+def _beyond_parts(odds: _Odds, known: _Odds) -> dict[tuple[int, ...], float]:
+    """The sets that are more probable than all known ones with one candidate less."""
+    parts = {frozenset(chosen): value for chosen, value in known.items()}
+    return {c: o for c, o in odds.items() if o > max(parts.get(frozenset(c) - {one}, -np.inf) for one in c)}

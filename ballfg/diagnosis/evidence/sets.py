@@ -1,8 +1,7 @@
 """Weighs sets of effects beside something nameless, all from one linearisation.
 
-Patterns without a name follow the samples wherever the effects alone do not, so that the paths of two refits may lie
-apart and the evidence of each hold the error of its own linearisation. About the path that comes closest to the
-samples, the linear model of all sets is the same.
+Patterns follow the samples wherever the effects alone do not, so that two refits would hold the errors of two
+linearisations. About the path that comes closest to the samples, the linear model of all sets is the same.
 """
 
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Finds the sizes of the noise that maximise the evidence, by its derivatives.
+"""Finds the sizes of the noise that maximise the evidence, and damped steps to more probable common unknowns.
 
 What a wrong model cannot explain counts as its noise.
 """
@@ -13,6 +13,8 @@ from scipy import linalg
 from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Local, Noise, Posterior, Weights, posterior
 from ballfg.diagnosis.evidence.rows import Rows
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.system import bounded_step
 from ballfg.state import STATE_DIM
 
 LEAST, MOST = -5.0, 5.0  # Bounds of the logarithm of a size over its unit
@@ -29,15 +31,6 @@ class Start:
 
     noise: Noise
     weights: Sequence[Weights] | None = None
-
-    def begun(self, rows: Sequence[Rows]) -> Sized:
-        """The likelihood of rows with these sizes, and the weights of what they leave.
-
-        Labels begin with a weight of one: their loss is not convex, and one that a wrong model contradicts would stay
-        out.
-        """
-        known = self.weights and [(samples, np.ones_like(spins), cost) for samples, spins, cost in self.weights]
-        return Batches.of(rows, known).reweighted(self.noise), self.noise
 
 
 @dataclass(frozen=True)
@@ -74,8 +67,14 @@ def settled(
 
 
 def begun(rows: Sequence[Rows], start: Start | None) -> Sized:
-    """The likelihood and the sizes with which a start, as of `settled`, begins."""
-    return (Batches.of(rows), Noise()) if start is None else start.begun(rows)
+    """The likelihood and the sizes with which a start, as of `settled`, begins, and the weights of what they leave.
+
+    Labels begin with a weight of one: their loss is not convex, and one that a wrong model contradicts would stay out.
+    """
+    if start is None:
+        return Batches.of(rows), Noise()
+    known = start.weights and [(samples, np.ones_like(spins), cost) for samples, spins, cost in start.weights]
+    return Batches.of(rows, known).reweighted(start.noise), start.noise
 
 
 def climbed(starts: Sequence[Sized], precision: Array, away: Array, own: int | None = None) -> Sized:
@@ -148,21 +147,13 @@ def slopes_at(
 
 @dataclass(frozen=True)
 class _Shown:
-    """What one batch shows of the sizes.
+    """What one batch shows of the sizes."""
 
-    Attributes:
-        squares: (8,) expected ones over the variance, of spins and random columns by their kinds.
-        unknowns: number of first states and random columns.
-        along: (n, d) as of `Slopes`.
-        products: (9, 9) inner products of what each size's rows or columns show, less what local unknowns absorb.
-        common: (c, 9) their inner products with the common columns, less the same.
-    """
-
-    squares: Array
-    unknowns: int
-    along: Array
-    products: Array
-    common: Array
+    squares: Array  # (8,) expected ones over the variance, of spins and random columns by their kinds
+    unknowns: int  # Number of first states and random columns
+    along: Array  # (n, d) as of `Slopes`
+    products: Array  # (9, 9) inner products of what each size's rows or columns show, less what local unknowns absorb
+    common: Array  # (c, 9) their inner products with the common columns, less the same
 
 
 def _shown(likelihood: Likelihood, noise: Noise, local: Local, found: Posterior) -> _Shown:
@@ -207,3 +198,51 @@ def _products(likelihood: Likelihood, noise: Noise, upper: Array, solved: Array,
     local = upper.swapaxes(1, 2) @ rows[:, :end]
     common = (rows[:, end:-1] - solved[:, :-1] @ local).sum(axis=0)
     return products - np.einsum("nla,nlb->ab", local, local), common
+
+
+FIRST_DAMPING, DAMPED, LESS = 0.1, 10.0, 4.0
+"""Damping of a step after a whole one that failed, its factor after a further failure, its divisor after a success."""
+HARDLY, MOSTLY = 0.25, 0.75
+"""Shares of a step's expected gain: with less it fails, with more the next one is damped less."""
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """The density of the tracks about the common unknowns of a fit, as far as it is quadratic.
+
+    Patterns are no unknowns of the fit: at its new values they are as free as before.
+
+    Attributes:
+        information, slope: (c, c) and (c,) of its logarithm.
+        limits: smallest and largest step (c,).
+        damping: of the next step, as in `bounded_step`.
+    """
+
+    information: Array
+    slope: Array
+    limits: tuple[Array, Array]
+    damping: float = 0.0
+
+    @classmethod
+    def of(cls, fit: Fit, found: Posterior) -> "Ahead":
+        """From the posterior about a fit."""
+        own = len(fit.problem.common_precision)
+        information: Array = np.asarray(np.linalg.inv(found.covariance[:own, :own]), dtype=np.float64)
+        return cls(information, information @ found.mean[:own], fit.limits)
+
+    def step(self, damping: float) -> tuple[Array, float]:
+        """(c,) a step within the limits, and the logarithm of the density that it should gain."""
+        step = bounded_step(self.information, self.slope, *self.limits, damping)
+        return step, float(step @ (self.slope - 0.5 * self.information @ step))
+
+    @property
+    def gain(self) -> float:
+        """What the whole step should gain."""
+        return self.step(0.0)[1]
+
+
+def next_damping(damping: float, share: float) -> float:
+    """The damping of the step after one that gained a share of what it promised."""
+    if share < MOSTLY:
+        return damping
+    return damping / LESS if damping > FIRST_DAMPING / LESS else 0.0

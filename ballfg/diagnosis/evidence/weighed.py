@@ -7,12 +7,21 @@ from itertools import combinations
 import numpy as np
 
 from ballfg.arrays import Array, Mask
-from ballfg.diagnosis.evidence.ahead import DAMPED, FIRST_DAMPING, HARDLY, Ahead, next_damping
 from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
 from ballfg.diagnosis.evidence.prior import WIDTHS, Priors, choice_odds, log_odds, within
 from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, Rows, random_motion, rows_beside
-from ballfg.diagnosis.evidence.sizes import Sized, Start, begun, climbed
+from ballfg.diagnosis.evidence.sizes import (
+    DAMPED,
+    FIRST_DAMPING,
+    HARDLY,
+    Ahead,
+    Sized,
+    Start,
+    begun,
+    climbed,
+    next_damping,
+)
 from ballfg.diagnosis.fit.fit import followed, with_guesses
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
@@ -53,13 +62,9 @@ class Weight:
 
 @dataclass(frozen=True)
 class Smaller(Weight):
-    """What decides about a model without some effects of another, whose linearisation foretells it.
+    """What decides about a model without some effects of another, whose linearisation foretells it."""
 
-    Attributes:
-        step: (c,) of the other one's common unknowns to the most probable ones where those effects are absent.
-    """
-
-    step: Array
+    step: Array  # (c,) of the other one's common unknowns to the most probable ones where those effects are absent
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Fits a declared model jointly: first states stretch by stretch, coefficients and launcher over all of them.
 
-The method is Gauss-Newton with Levenberg's damping. The residuals give the scale of the noise along each axis, and the
-scatter of unlabelled spins about the launcher's mean. Coefficients have the priors of their effects, so that
-coefficients which the data cannot determine keep their declared values.
+The method is Gauss-Newton with Levenberg's damping. Coefficients that the data cannot determine keep their declared
+values by the priors of their effects.
 """
 
 import copy
@@ -85,15 +84,10 @@ def first_guess(problem: Problem, label_noise: float, spin_prior: float) -> tupl
 def fit_problem(
     problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: bool = True, steps: int = MOST_STEPS
 ) -> Fit:
-    """Minimises over all unknowns, and estimates the scale of the noise in turns.
+    """Minimises over all unknowns, and if `settle_noise` estimates the scale of the noise in turns.
 
-    Args:
-        problem: the data, the model and the priors.
-        unknowns: first guess. Every stretch must reach its contacts from there, as `reachable` ensures; else the result
-            is the first guess itself, with infinite cost.
-        noise: scales to start from; constant unless `settle_noise`.
-        settle_noise: True to estimate the scale of the noise.
-        steps: largest number of Gauss-Newton steps.
+    Args: unknowns: first guess. Every stretch must reach its contacts from there, as `reachable` ensures; else the
+        result is the first guess itself, with infinite cost.  noise: scales to start from.  steps: at most so many.
     """
     result = _minimise(Fit.at(problem, unknowns, noise), steps)
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
@@ -108,8 +102,7 @@ def fit_problem(
 def followed(fit: Fit, unknowns: Unknowns) -> Fit:
     """The fit at other common unknowns, its first states those whose paths come closest to the samples.
 
-    Args: unknowns: their first states are not used.
-    Returns: of infinite cost if a path misses a contact.
+    Its cost is infinite if a path misses a contact.  Args: unknowns: their first states are not used.
     """
     names, system = fit.problem.free, fit.linearised
     values = np.array([unknowns.values[name] - fit.unknowns.values[name] for name in names])
@@ -186,9 +179,8 @@ def _moved(now: Fit, system: System, damping: float) -> Fit:
 def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
     """The fit after a further correction of the first states, following a step of all unknowns.
 
-    The linearised problem leaves out the product of a step of coefficients and a step of states. With many samples that
-    product is large, and first states can absorb most of it. The derivatives stay; a stretch without a gain keeps its
-    state.
+    They can absorb most of what the linearised problem leaves out: the product of a step of coefficients and one of
+    states. The derivatives stay; a stretch without a gain keeps its state.
     """
     correction = system.start_correction(moved.weighted_residual(weights))
     unknowns = replace(moved.unknowns, starts=moved.unknowns.starts + correction)
@@ -207,9 +199,8 @@ def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
 def _settled(result: Fit) -> Noise:
     """Noise from the residuals: their median absolute deviation, corrected for the degrees of freedom of the states.
 
-    One scale serves all axes: missing physics often acts along one of them. With a scale for each, that axis would
-    count as noisy and hide it. Axes without any noise were not measured (a ball that is dropped along x = y = 0): they
-    do not count.
+    One scale serves all axes: missing physics often acts along one of them, which would count as noisy and hide it.
+    Axes without any noise were not measured (a ball that is dropped along x = y = 0): they do not count.
     """
     whitened = result.whitened[result.problem.stretches.used.numpy()]
     measured = [axis for axis in range(3) if _spread(result, whitened[:, axis]) > LEAST_SPREAD]

@@ -165,9 +165,8 @@ def _chosen(dataset: Dataset, most: int) -> tuple[list[Track], list[str]]:
 def _excess_noise(tracks: Sequence[Track], settings: Settings) -> float:
     """Noise of the tracks over the stated noise, at least 1.
 
-    Outliers are recognised by their distance from the expected place of the ball. If the stated noise is too small,
-    ordinary samples that differ from their neighbours would count as outliers. The errors of the remaining samples
-    would then be alike, as if a force were missing.
+    If the stated noise is too small, ordinary samples that differ from their neighbours would count as outliers, and
+    the errors of the others would be alike, as if a force were missing.
     """
     shown = estimate_position_noise(tracks)
     return max(1.0, float(np.max(shown / (settings.position_scale * np.asarray(settings.position_noise)))))

@@ -1,8 +1,7 @@
 """Builds blocks of unnamed patterns: a force, a kick or a position error that depends on some quantities.
 
-A block has one column for every quantity (centred, in units of its scatter over the data) along every axis: the
-response of the samples to such a pattern. Quantities and axes are named in words. A further block holds declared
-coefficients that change over a recording.
+A block has one column for every quantity (centred, in units of its scatter over the data) along every axis. A further
+block holds declared coefficients that change over a recording.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +12,7 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, weighted
+from ballfg.diagnosis.fit.response import ArcResponse, weighted
 from ballfg.diagnosis.fit.system import System
 from ballfg.dynamics.effects.generic import flight_axes
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -69,7 +68,7 @@ def blocks_of(fit: Fit) -> list[Block]:
     blocks = [_flight(fit, fit.arcs, group, axes) for group, axes in FLIGHT]
     if after:
         blocks += [_contact(fit, after, group, axes) for group, axes in CONTACT]
-    return blocks + [_measurement(fit, fit.path, group) for group in MEASUREMENT]
+    return blocks + [_measurement(fit, group) for group in MEASUREMENT]
 
 
 def _flight(fit: Fit, arcs: list[ArcResponse], group: Names, axes: Names) -> Block:
@@ -113,8 +112,8 @@ def _over_arcs(
     return Block(kind, group, axes, scale(values), columns)
 
 
-def _measurement(fit: Fit, path: FittedPath, group: Names) -> Block:
-    used, times = fit.problem.stretches.used.numpy(), path.times.T.numpy()
+def _measurement(fit: Fit, group: Names) -> Block:
+    used, path, times = fit.problem.stretches.used.numpy(), fit.path, fit.path.times.T.numpy()
     found = _chosen(group, _quantities(path.states, times, np.zeros_like(times)))
     scale = _Scale.of(group, found[used])
     moved = PLAUSIBLE["measurement"] * _spread(_axes(WORLD, path.states), scale(found))
@@ -177,11 +176,9 @@ def _axes(names: Names, states: Array) -> Array:
 def drift_block(fit: Fit, system: System) -> Block | None:
     """One column for each free coefficient: one prior sigma below its value at the first track, one above at the last.
 
-    It tests for another table, another ball or another day: tracks of several sessions in one dataset contradict each
-    other, though none of them shows a pattern of its own.
+    It tests for another table, ball or day. None without free coefficients, or with one track only.
 
     Args: system: of the fit, linearised at its minimum.
-    Returns: None without free coefficients, or with one track only.
     """
     free = {name: c for name, c in fit.problem.free.items() if name not in fit.problem.deviations}
     number = fit.problem.stretches.track.astype(np.float64)

@@ -256,7 +256,7 @@ class Fit:
     @cached_property
     def arcs(self) -> list[ArcResponse]:
         """Responses of all arcs of the motion to forces and kicks, in order of time."""
-        return list(responses(self, self.path))
+        return list(responses(self))
 
     def __getstate__(self) -> dict[str, object]:
         """The fields alone: other processes compute again what they need of the rest, which is larger."""

@@ -95,11 +95,11 @@ def fitted_path(fit: "Fit") -> FittedPath:
     return FittedPath(motion, times, states)
 
 
-def responses(fit: "Fit", path: FittedPath) -> Iterator[ArcResponse]:
-    """The responses of all arcs, in order of time; path: `fitted_path(fit)`."""
-    for number, arc in enumerate(path.motion.arcs):
+def responses(fit: "Fit") -> Iterator[ArcResponse]:
+    """The responses of all arcs, in order of time."""
+    for number, arc in enumerate(fit.path.motion.arcs):
         for part in torch.split(torch.arange(len(arc.rows)), MOST_STRETCHES):
-            yield _arc_response(fit, path, number, part)
+            yield _arc_response(fit, number, part)
 
 
 def weighted(fit: "Fit", positions: Array, rows: Index) -> Array:
@@ -108,8 +108,8 @@ def weighted(fit: "Fit", positions: Array, rows: Index) -> Array:
     return np.concatenate((moved, np.zeros((len(rows), 3, positions.shape[-1]))), axis=1)
 
 
-def _arc_response(fit: "Fit", path: FittedPath, number: int, part: Tensor) -> ArcResponse:
-    arc = path.motion.arcs[number]
+def _arc_response(fit: "Fit", number: int, part: Tensor) -> ArcResponse:
+    path, arc = fit.path, fit.path.motion.arcs[number]
     rows, begun = arc.rows[part], arc.begun[part]
     contacts, until = path.motion.contacts[rows, number:], path.times[-1, rows]
     if contacts.shape[1]:
@@ -118,7 +118,7 @@ def _arc_response(fit: "Fit", path: FittedPath, number: int, part: Tensor) -> Ar
     count = max(1, int(np.ceil(duration.max() / NODE)))
     step = duration / count
     nodes = torch.from_numpy((np.arange(count)[:, None] + 0.5) * step)  # (q, m) s since the arc began
-    states, by_first, positions = _shot(fit, path, number, part, nodes)
+    states, by_first, positions = _shot(fit, number, part, nodes)
     since = path.times[:, rows].T.numpy() - begun.numpy()[:, None]
     return ArcResponse(
         rows=rows.numpy(),
@@ -142,12 +142,9 @@ def _at(arc: Arc, rows: Tensor, times: Tensor) -> Array:
     return np.asarray(arc.states(asked.unsqueeze(0))[0, where].numpy())
 
 
-def _shot(fit: "Fit", path: FittedPath, number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
-    """A shot from an arc's first state: states at nodes, and two derivatives by that first state.
-
-    Returns: states (m, q, 9), their derivatives (m, q, 9, 9), those of the measured positions (m, k, 3, 9).
-    """
-    model, stretches, arc = fit.problem.model, fit.problem.stretches, path.motion.arcs[number]
+def _shot(fit: "Fit", number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
+    """States (m, q, 9) at nodes, and derivatives by an arc's first state: theirs, and (m, k, 3, 9) of positions."""
+    model, stretches, path, arc = fit.problem.model, fit.problem.stretches, fit.path, fit.path.motion.arcs[number]
     rows, begun, start = arc.rows[part], arc.begun[part], arc.nodes[0][part]
     values = {name: value if isinstance(value, float) else value[rows.numpy()] for name, value in fit.values.items()}
     times, heights = path.times[:, rows] - begun, stretches.heights[rows, number:]

@@ -188,8 +188,8 @@ def _compiled_derivatives(functions: CompiledModel, asked: _Asked) -> Sensitivit
 def _written(asked: _Asked, motion: RepeatedMotion, spins_moved: Tensor) -> Sensitivity:
     """The derivatives of what the instrument writes, by the chain rule.
 
-    It depends on few numbers: on the true states at a sample and at delays after it, and on coefficients. Torch's
-    reverse mode gives its slopes by them, machine code the derivatives of the states.
+    Torch's reverse mode gives its slopes by the states at a sample and at delays after it and by coefficients, machine
+    code the derivatives of the states.
 
     Args: motion: with the direction along which delays grow last.  spins_moved: (n, 3, d) of the first spins.
     """

@@ -1,8 +1,7 @@
 """Integrates motion from a first state through a known sequence of contacts, smoothly in all arguments.
 
-A rollout finds the bounces itself, so that a small change can add or lose one. Here the contacts are given, each with a
-guess of its time, and only their times are solved for. Each row flies in equal steps of its own from contact to
-contact; a Hermite polynomial gives the states in between.
+Only the times of the given contacts are solved for, each from a guess: a rollout, which finds them itself, can add or
+lose one by a small change.
 """
 
 import math

@@ -1,7 +1,6 @@
 """Finds errors of stamps from the tracks alone: counted frames of which some were dropped, and a wrong clock.
 
-Both must be known before a track is cut into flights. With a clock that is wrong by tens of percent, or with a step of
-the ball that is twice as long as the one before, free flight looks like a chain of hits.
+Both must be known before a track is cut into flights: with them free flight looks like a chain of hits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -134,9 +133,7 @@ def frame_counts(track: Track) -> Index:
 
 
 def _changes(numbers: Index, positions: Array, quiet: float) -> Index:
-    """(n - 1,) number of frames to add to each step so that the motion around it becomes smoothest.
-
-    Of neighbouring steps only the one with the largest gain changes.
+    """(n - 1,) number of frames to add to each step for the smoothest motion; of neighbours only the best changes.
 
     Args: numbers: (n,) frames so far.  positions: (n, 3) m.  quiet: m^2, variance of a coordinate's noise.
     """

@@ -1,8 +1,6 @@
 """Cuts tracks into stretches, their parts without a hit, and holds them as one padded batch.
 
-A stretch starts at its first usable sample with a state of its own. The ball flies and bounces at contacts whose order
-is known. The stretch ends before the next hit or when the ball comes to rest. The motion is deterministic, so what the
-samples hold beyond it is noise or an effect that the model lacks.
+The motion of a stretch is deterministic, so what its samples hold beyond it is noise or an effect that the model lacks.
 """
 
 import math

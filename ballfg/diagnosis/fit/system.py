@@ -1,8 +1,6 @@
 """Eliminates the first states from the linearised problem, stretch by stretch.
 
-Common columns belong to unknowns that act on all stretches: declared coefficients, launcher settings and candidate
-effects. The best first state absorbs a part of each column; the rest is its projected signature. Tests and fits need
-only the inner products of projected signatures, summed over each track.
+The best first state absorbs a part of each common column; tests and fits need only the inner products of the rest.
 """
 
 from dataclasses import dataclass

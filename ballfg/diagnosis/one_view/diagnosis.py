@@ -92,9 +92,7 @@ def told(
 ) -> Diagnosis:
     """The diagnosis that a search leads to.
 
-    Args:
-        declared: the model.  tracks: all that were looked at.  name: of the dataset.
-        predicted: the errors of a model with a camera's errors.  name_at: as for `diagnose`.
+    Args: tracks: all that were looked at.  name: of the dataset.  predicted: errors of a model with a camera's errors.
     """
     named = _named(found, name_at)
     plain, best, fitted = found.weights.weighed(()), found.weights.weighed(named), found.weights.fitted(named)
@@ -224,9 +222,8 @@ def _left(found: Found, plain: Set, best: Set) -> Unexplained:
     """The test for whether the strokes, filmed again by the corrected laws, pull them as the real ones do."""
     p_value, share = found.weights.by_chance(best), min(1.0, best.misfit / max(plain.misfit, 1e-12))
     words = "the sightings pull the laws away from strokes filmed again, by more than chance"
-    return Unexplained(
-        words if p_value < ALARM else "", share, (GenericTest("sightings", words, p_value, share),), None
-    )
+    test = GenericTest("sightings", words, p_value, share)
+    return Unexplained(words if p_value < ALARM else "", share, (test,), None)
 
 
 def _calibrated(one: Set, declared: AnalyticModel) -> Mapping[str, Value]:
@@ -238,11 +235,8 @@ def _calibrated(one: Set, declared: AnalyticModel) -> Mapping[str, Value]:
 
 def _excluded(found: Found, tracks: Sequence[Track]) -> tuple[str, ...]:
     used = {stroke.track.name for stroke in found.strokes}
-    return tuple(
-        f"{track.name}: its sightings do not show well how far away it was"
-        for track in tracks
-        if track.name not in used
-    )
+    lost = [track.name for track in tracks if track.name not in used]
+    return tuple(f"{name}: its sightings do not show well how far away it was" for name in lost)
 
 
 def _remarks(found: Found, named: Sequence[Hypothesis]) -> tuple[str, ...]:

@@ -1,8 +1,7 @@
 """Looks for what the laws lack in the strokes of one camera.
 
-All sets of effects are weighed about laws without any. The likeliest effects are then followed one by one: the most
-probable set that holds one moves the laws, until it is found where they are. A strength that is far off is not seen in
-one linear step, and of two effects that look alike from afar only the right one leaves nothing where it leads to.
+All sets of effects are weighed about laws without any. The likeliest are then followed one by one, each until it is
+found where it has moved the laws: a strength that is far off is not seen in one linear step.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -116,10 +115,7 @@ def search(
 
 
 def _with_lift(end: "_Place", model: AnalyticModel, declared: Mapping[str, float]) -> Set:
-    """The declared coefficients and the lift, which strokes without spin labels show at their bounces.
-
-    The search leaves the lift where the model has it: a free one takes over a part of what other effects do.
-    """
+    """The declared coefficients and the lift, which is not free in the search: it would take over a part of effects."""
     lift = model.declared_coefficients().get(LIFT)
     sizes = dict(declared) | ({LIFT: lift.sigma} if lift is not None and lift.sigma > 0.0 else {})
     given = {name: float(model.get_parameter(name).detach()) for name in sizes}
@@ -230,8 +226,7 @@ def _asking(
 ) -> tuple[Laws, list[Hypothesis], Array]:
     """The laws with all effects of the catalogue that one camera can be asked about, and where each is absent.
 
-    Effects of one place in the room, which have many shapes, and those of positions and labels are left out. So are
-    those that are a wrong clock to spins without labels.
+    Left out are effects of one place in the room, of positions and labels, and those that resemble a wrong clock.
     """
     known = [e for e in catalogue if e.kind != "measurement" and e.name not in CLOCKS]
     listed = hypotheses(model, _scene(strokes), known)

@@ -1,13 +1,8 @@
 """Estimates strokes with given laws, and films them again as these laws would have them.
 
-The derivatives of a stroke's objective by common strengths are its *scores*. Where depth comes from the motion they do
-not scatter about zero, right laws or not: a state that a wrong law fits better pulls its own estimate along. The same
-strokes filmed again have scores with the same pull, so that the difference of both is free of it (C. Gourieroux, A.
-Monfort, E. Renault, "Indirect inference", J. Appl. Econometrics 8, 1993).
-
-How far strokes scatter about the laws is chosen too: the less they do, the smaller an effect they show. The usual noise
-of such tracks is that of measured strokes. A share of it is chosen with which the sightings are most probable, the
-states integrated out in Laplace's approximation.
+The derivatives of a stroke's objective by common strengths, its *scores*, do not scatter about zero where depth comes
+from the motion. Those of the same strokes filmed again have the same bias (docs/derivations/diagnosis.md). How far
+strokes scatter about the laws is the share of the usual noise that makes their sightings most probable.
 """
 
 from collections.abc import Mapping, Sequence
@@ -129,10 +124,8 @@ def filmed_again(stroke: Stroke, laws: Laws, seed: Sequence[int]) -> Track | Non
         radii = np.stack((np.where(radii[:, 0] > 0.0, np.maximum(size, radii[:, 1]), 0.0), radii[:, 1]), axis=1)
     written = sightings.times[0] + slower * (sightings.times - sightings.times[0])
     filmed = replace(sightings, pixels=pixels + noise[..., 0], times=written, radii=radii)
-    given_bounces = known_bounces(seen, slower)
-    return sighted_track(
-        stroke.track.name, filmed, seen.cameras, model=laws.model, surfaces=laws.surfaces, bounces=given_bounces
-    )
+    bounces, name = known_bounces(seen, slower), stroke.track.name
+    return sighted_track(name, filmed, seen.cameras, model=laws.model, surfaces=laws.surfaces, bounces=bounces)
 
 
 def _flown(stroke: Stroke, laws: Laws, moments: Array, rng: np.random.Generator) -> Array:
@@ -160,9 +153,8 @@ def _flown(stroke: Stroke, laws: Laws, moments: Array, rng: np.random.Generator)
 
 def all_estimated(laws: Laws, tracks: Sequence[Track], jobs: int) -> list[Stroke]:
     """The strokes of all tracks whose place is known well."""
-    return [
-        one for part in do_all([partial(_estimates, laws, part) for part in parts_of(tracks)], jobs) for one in part
-    ]
+    found = do_all([partial(_estimates, laws, part) for part in parts_of(tracks)], jobs)
+    return [one for part in found for one in part]
 
 
 def scores_again(laws: Laws, flown: Sequence[tuple[Laws, int]], strokes: Sequence[Stroke], jobs: int) -> list[Array]:

@@ -1,9 +1,7 @@
-"""Weighs sets of effects by the scores of strokes, in a linear model of their means.
+"""Weighs sets of effects by the scores of strokes, in a linear model of their means (docs/derivations/diagnosis.md).
 
-The mean scores of the strokes, less those of the same strokes filmed again, are normal about zero if the laws are
-right. A strength that is off by d moves them by what strokes show that are filmed again with it: the slopes. The
-strengths of a set of effects have the priors of every diagnosis (docs/derivations/diagnosis.md), those of declared
-coefficients the model's, and all others are where their effects are absent.
+The strengths of a set have the priors of every diagnosis, those of declared coefficients the model's, and all others
+are where their effects are absent.
 """
 
 from collections.abc import Sequence

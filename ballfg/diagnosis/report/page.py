@@ -91,10 +91,8 @@ def _finding(finding: Finding) -> Html:
     )
     verb = "falls" if finding.delta_bic < 0 else "rises"
     gain = "adds" if finding.held_out_gain >= 0 else "takes away"
-    others, evidence = (
-        finding.indistinguishable_from,
-        [f"Probability that it is there: {wording.odds(finding.probability)}."],
-    )
+    others = finding.indistinguishable_from
+    evidence = [f"Probability that it is there: {wording.odds(finding.probability)}."]
     if others:
         evidence.append(
             f"That it or one of those that cannot be told from it is there: {wording.odds(finding.together)}."

@@ -46,9 +46,8 @@ def flight_in_time(series: Series) -> Figure:
         _means(column, flight.times, *in_flight(flight), flight.stretch, label)
         column[0].set_title(label, size=11)
         column[-1].set_xlabel("time since launch or hit, s")
-    _name_rows(panels, IN_FLIGHT, "m/s²")
-    figure.suptitle("Acceleration that the model lacks: mean over stretches ± standard error", size=11)
-    return figure
+    title = "Acceleration that the model lacks: mean over stretches ± standard error"
+    return _titled(figure, panels, IN_FLIGHT, "m/s²", title)
 
 
 def flight_against(series: Series) -> Figure:
@@ -64,9 +63,8 @@ def flight_against(series: Series) -> Figure:
         return conditions, *in_flight(flight), flight.stretch
 
     figure, panels = _against(series, parts, (10.5, 6.2))
-    _name_rows(panels, IN_FLIGHT, "m/s²")
-    figure.suptitle("Acceleration that the model lacks, against the state: mean ± standard error", size=11)
-    return figure
+    title = "Acceleration that the model lacks, against the state: mean ± standard error"
+    return _titled(figure, panels, IN_FLIGHT, "m/s²", title)
 
 
 def contacts(series: Series, radius: float) -> Figure:
@@ -92,10 +90,8 @@ def contacts(series: Series, radius: float) -> Figure:
     reach = 1.15 * float(np.quantile(np.abs(np.concatenate(points)), SHOWN_SHARE))
     if reach > 0.0:
         panels[0, 0].set_ylim(-reach, reach)
-    _name_rows(panels, AT_CONTACT, "m/s")
     title = "Kick to the velocity at a contact that the model lacks: each contact, mean ± standard error"
-    figure.suptitle(title, size=11)
-    return figure
+    return _titled(figure, panels, AT_CONTACT, "m/s", title)
 
 
 def measurements(series: Series) -> Figure:
@@ -112,9 +108,8 @@ def measurements(series: Series) -> Figure:
         return conditions, values, np.ones_like(values), measured.stretch
 
     figure, panels = _against(series, parts, (13.0, 6.0))
-    _name_rows(panels, tuple(f"residual {a}" for a in "xyz"), "sigma")
-    figure.suptitle("Measured minus fitted position over its noise: mean ± standard error", size=11)
-    return figure
+    title = "Measured minus fitted position over its noise: mean ± standard error"
+    return _titled(figure, panels, tuple(f"residual {a}" for a in "xyz"), "sigma", title)
 
 
 def histogram(series: Series) -> Figure:
@@ -248,17 +243,13 @@ def _means(column: Iterable[Axes], against: Array, values: Array, sigmas: Array,
     for axes, component, sigma in zip(column, values.T, sigmas.T, strict=True):
         bins = binned(against, component, sigma, stretch)
         axes.axhline(0.0, color="black", linewidth=0.8, zorder=0)
-        axes.errorbar(
-            *(bins.centres, bins.means, bins.errors),
-            fmt="o-",
-            color=colour,
-            label=label,
-            linewidth=1.2,
-            markersize=4,
-            capsize=2,
-        )
+        means = (bins.centres, bins.means, bins.errors)
+        axes.errorbar(*means, fmt="o-", color=colour, label=label, linewidth=1.2, markersize=4, capsize=2)
 
 
-def _name_rows(panels: NDArray[np.object_], names: Sequence[str], unit: str) -> None:
+def _titled(figure: Figure, panels: NDArray[np.object_], names: Sequence[str], unit: str, title: str) -> Figure:
+    """The figure with the names of its rows and a title."""
     for axes, name in zip(panels[:, 0], names, strict=True):
         axes.set_ylabel(f"{name}, {unit}")
+    figure.suptitle(title, size=11)
+    return figure

@@ -1,7 +1,6 @@
 """Writes effects, numbers with known digits and units, and the answer in one sentence in words for people.
 
-The words of an effect are those of its class. One without words, such as a user's own, gets its name with spaces and
-its own `sentence`. `TERMS` explains the words of a report, on hover and in a list at the end of the page.
+The words of an effect are those of its class; one without words gets its name with spaces and its own `sentence`.
 """
 
 import math

@@ -1,11 +1,8 @@
 """Tests for remaining patterns of any cause, and locates them; tests the noise on tracks outside of the fit.
 
-Each block of patterns (module `patterns`) is tested like a candidate effect: by the scores of its columns, with states
-and declared coefficients projected out and tracks as independent units. Only the most visible directions of a large
-block are tested; their choice does not depend on the residuals.
-
-These tests look at the fit of the search half. Where the halves differ, as with two balls thrown in turn, or where
-predictions see something else than the fit, that fit is good and predictions are not: `predicted_test`.
+Each block of patterns is tested like a candidate effect, in its most visible directions; their choice does not depend
+on the residuals. Where the halves differ, as with two balls thrown in turn, or predictions see something else than the
+fit, the fit is good and predictions are not: `predicted_test`.
 """
 
 import math

@@ -1,9 +1,7 @@
 """Finds the spin labels that contradict their flights, with probabilities.
 
-A label is right, with its stated error, or wrong, with a far larger one. Both are compared with the flight's spin,
-including the scatter of flight and bounces. The share of wrong labels, the size of their errors, and the excess of
-right labels' errors are unknown; all labels of the recording determine them together, and they are integrated out. So
-each label has a probability of being wrong, and a single doubtful one among many does not count.
+All labels of a recording determine together what share of them is wrong and by how much right and wrong ones err, so
+that a single doubtful one among many does not count (docs/derivations/diagnosis.md).
 """
 
 from collections.abc import Sequence
@@ -81,12 +79,9 @@ def scattering_model(
 ) -> tuple[AnalyticModel, Settings]:
     """A corrected model with refitted coefficients, and the settings for predictions with it.
 
-    The diagnosis' own fit flies deterministically. If real bounces scatter, it adapts coefficients and spins to them,
-    and right labels then seem wrong. Here each track is smoothed with process noise, and the coefficients are the mean
-    of a population of tracks. The noise about that model comes from forecasts, as for predictions.
-
-    The declared coefficients of flight and bounce are refitted to tracks with spin labels, about their declared values;
-    added effects and values that differ between tracks stay. The tracker's memory and jitter are used if found.
+    If bounces scatter, the diagnosis' own deterministic fit adapts coefficients and spins to them, and right labels
+    seem wrong. Here each track with a spin label is smoothed with process noise, and the declared coefficients of
+    flight and bounce are the mean of a population; added effects and values that differ between tracks stay.
     """
     plain = with_effects(model)
     plain.variations = model.variations

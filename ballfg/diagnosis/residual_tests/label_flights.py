@@ -1,10 +1,8 @@
 """Computes the probability of a spin label given its flight, for several sizes of the label's error.
 
-The smoother gives the spin at the first sample with the covariance of its process noise: flight and bounces scatter,
-and so does the spin estimated from a flight. The density of a label given the samples is a ratio of two marginal
-likelihoods, that of samples and label and that of the samples alone, each by Laplace's approximation. The second is the
-same for all errors of the label, so that it drops out. A minimum near the label is valid if the label is right, another
-one if it may be wrong: sliding and gripping bounces have different minima.
+The density of a label is a ratio of two marginal likelihoods, as docs/derivations/diagnosis.md derives.
+A minimum near the label is valid if the label is right, another one if it may be wrong: sliding and gripping bounces
+have different minima.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,6 @@
 """Computes the residuals of a fit: accelerations in flight, kicks at contacts, errors of measured positions.
 
-The first two are like a smoother's: free accelerations in short bins and free kicks after contacts, all estimated
-together with the first state of their stretch, under the priors of a white process noise.
+The first two are estimated together with the first state of their stretch, under the priors of a white process noise.
 """
 
 from collections import defaultdict

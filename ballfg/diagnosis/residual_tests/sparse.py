@@ -1,8 +1,6 @@
 """Describes a pattern that no named effect explains by a few generic terms, if the model then predicts better.
 
-The terms are chosen by forward selection on projected Gram matrices: each step takes the term with the largest
-additional gain, until none exceeds its penalty. Terms that later ones made superfluous are then dropped. Source: J.
-Chen and Z. Chen 2008, "Extended Bayesian information criteria for model selection with large model spaces", gamma = 1.
+They are chosen by forward selection with the extended BIC (J. Chen and Z. Chen 2008, gamma = 1).
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,6 @@
 """Reports memory of the tracker and jitter of the stamps as findings, after the search for effects.
 
-A memory would absorb any effect that bends flights slowly, so effects are searched first. The remaining errors are then
-tested for memory and jitter, on both halves of the tracks.
+A memory would absorb any effect that bends flights slowly, so effects are searched first.
 """
 
 from dataclasses import dataclass, replace

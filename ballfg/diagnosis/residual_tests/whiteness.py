@@ -1,10 +1,6 @@
 """Tests for whiteness along the tracks: neighbouring errors correlate if the motion differs from the model.
 
-Residuals of a good fit are not white themselves: r = M e, with white noise e and the projection M of the fit. For a
-kernel W over pairs of different samples, U = r'(W + c) r over the stretch's own mean square, with c = -tr(M W) / tr(M),
-has mean zero whatever the scale of the noise on that stretch, and cumulants that are traces of powers of M (W + c). The
-sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
-
+Residuals of a good fit are not white themselves; docs/derivations/diagnosis.md has the statistic U that allows for it.
 Errors of a tracker with known memory or jitter are whitened by their covariance first.
 """
 

@@ -108,19 +108,15 @@ def _apex_distances(evaluated: EvaluationTrack, prediction: TrackPrediction) -> 
     return np.array([d for d in found if np.isfinite(d)])
 
 
-def on_others(fitted: Fit, others: Stretches) -> Fit:
-    """The fit of new first states to stretches of other tracks, with all else as fitted."""
-    stretches = reachable(fitted.problem.model, others, fitted.problem.by_stretch(fitted.unknowns.values, others))
-    problem = replace(fitted.problem, stretches=stretches, shared=False)
-    unknowns = replace(fitted.unknowns, starts=stretches.starts.numpy().copy())
-    return fit_problem(problem, unknowns, fitted.noise, settle_noise=False)
-
-
-def on_all(fitted: Fit, others: Fit) -> Fit:
-    """The fit to the tracks of two fits of one problem, at the same noise. others: as `on_others(fitted, ...)`."""
-    own, more = fitted.problem.stretches, others.problem.stretches
+def on_all(fitted: Fit, others: Stretches) -> Fit:
+    """The fit to stretches of other tracks too, at the same noise, from first states that fit them with all else so."""
+    reached = reachable(fitted.problem.model, others, fitted.problem.by_stretch(fitted.unknowns.values, others))
+    unknowns = replace(fitted.unknowns, starts=reached.starts.numpy().copy())
+    problem = replace(fitted.problem, stretches=reached, shared=False)
+    beside = fit_problem(problem, unknowns, fitted.noise, settle_noise=False)
+    own, more = fitted.problem.stretches, beside.problem.stretches
     stretches = joined([own, replace(more, track=more.track + own.track.max() + 1)])
-    starts = np.concatenate((fitted.unknowns.starts, others.unknowns.starts))
+    starts = np.concatenate((fitted.unknowns.starts, beside.unknowns.starts))
     unknowns = replace(fitted.unknowns, starts=starts)
     return fit_problem(replace(fitted.problem, stretches=stretches), unknowns, fitted.noise, settle_noise=False)
 
@@ -172,12 +168,7 @@ def noise_about(
 ) -> TrackNoise | None:
     """The noise of tracks about a calibrated model; None if they are too short.
 
-    Args:
-        model: with `trained`.
-        tracks: of its fit.
-        dataset: their origin.
-        tracker: fixed memory of the tracker and jitter of the stamps; None: the dataset's.
-        jobs: processes.
+    Args: model: with `trained`.  tracks: of its fit.  tracker: fixed memory and jitter; None: the dataset's.
     """
     tracker = tracker or TrackNoise()
     settings = dataset_settings(dataset, model)

@@ -16,7 +16,7 @@ from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
-from ballfg.diagnosis.search.evaluation import on_all, on_others
+from ballfg.diagnosis.search.evaluation import on_all
 from ballfg.diagnosis.search.models import WeighedModels, smaller_fit, weighed_without
 from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
 from ballfg.diagnosis.search.score import Scored
@@ -47,7 +47,7 @@ class Found(WeighedModels):
     """The models of a search, and the rounds that led to them."""
 
     def __init__(self, loop: "SearchLoop", first: Fit) -> None:
-        super().__init__(on_all(first, on_others(first, loop.holdout.held_out)), loop.jobs)
+        super().__init__(on_all(first, loop.holdout.held_out), loop.jobs)
         self.loop = loop
         self.rounds: list[Round] = []
         self.begun, self.together = 0, MOST_EFFECTS  # round with which a search began; effects that one may add
@@ -125,8 +125,8 @@ class Found(WeighedModels):
     def _exchanged(self, screen: Screen, scored: Sequence[Scored], tell: Callable[[str], None]) -> Refit | None:
         """The refit with another effect in the place of one that makes the model more probable; None if none does.
 
-        Those that are foretold to come close are refitted: they are what cannot be told apart. An absence that is many
-        standard deviations away lies beyond the linear range, so that close is a share of what the effect explains.
+        Those that are foretold to come close are refitted. An absence that is many standard deviations away lies beyond
+        the linear range, so that close is a share of what the effect explains.
         """
         best, scores = self.best, self.scores
         tasks: dict[frozenset[str], Callable[[], tuple[Refit, Weighed]]] = {}
@@ -192,10 +192,7 @@ class Found(WeighedModels):
     def _attempted(
         self, attempts: Sequence[Attempt], tell: Callable[[str], None]
     ) -> tuple[list[Refit], Weighed | None]:
-        """The refits of the most promising attempts, and the most probable model that they lead to; None without any.
-
-        What promises less than was gained already can wait for the next round.
-        """
+        """The refits of attempts that promise more than is gained, and the most probable model; None without any."""
         refits, winner = list[Refit](), None
         waiting = sorted(attempts, key=lambda attempt: -attempt.gain)
         while waiting and not self.is_better(winner, by=max(waiting[0].gain, 0.0)):
@@ -211,10 +208,7 @@ class Found(WeighedModels):
         return sorted(refits, key=lambda r: r.delta_bic), winner
 
     def _likely(self, refits: Sequence[Weighed]) -> Weighed | None:
-        """The most probable of some refits, and of them without an effect that they make superfluous; None without any.
-
-        One that takes the place of a named effect needs both for a while.
-        """
+        """The most probable of some refits, and of them without an effect that they make superfluous."""
         best, found = self.best, self.known(refits)
         scores = self.scores
         for model in list(found):
@@ -227,8 +221,8 @@ class Found(WeighedModels):
     def _smaller(self, model: Weighed) -> dict[frozenset[str], float]:
         """Logarithm of the odds of the models that a model holds, by their names.
 
-        Those that were weighed from there count so, the others at least as the linearisation foretells them: a refit
-        from elsewhere may have ended in a poorer minimum.
+        Those that were not weighed from there count at least as foretold: a refit from elsewhere may be in a poorer
+        minimum.
         """
         if not np.isfinite(model.evidence):
             return {}
@@ -240,7 +234,7 @@ class Found(WeighedModels):
     def _pruned(self, every: bool = False) -> bool:
         """Removes effects that later ones made superfluous, as the linearisation says and a refit confirms.
 
-        Args: every: refit without each effect. A strong one's absence lies beyond the linear range.
+        Args: every: refit without each effect: a strong one's absence lies beyond the linear range.
         Returns: whether the best model lost an effect.
         """
         whole = self.best
@@ -268,10 +262,7 @@ def _weighed_refit(
 def _in_place(
     best: Weighed, gone: Hypothesis, candidate: Scored, first: Fit, motion: Motion, halves: Mask
 ) -> tuple[Refit, Weighed]:
-    """The refit of a model with a candidate in the place of one of its effects, and how probable it is.
-
-    The more probable one of two: without the effect first, or with both for a while.
-    """
+    """The refit with a candidate in an effect's place, without that first or with both for a while, and its model."""
     refitted = refit(smaller_fit(best, [gone], first), candidate)
     named = (*(h for h in best.named if h.name != gone.name), candidate.hypothesis)
     found = weighed(refitted.fit, named, motion, halves, best)

@@ -120,14 +120,11 @@ class WeighedModels:
         return self.models[names]
 
     def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
-        """A model without some of its effects, and without those that need them.
-
-        It is weighed again from there if the linearisation says that it was found in a poorer minimum before.
-        """
+        """A model without some of its effects, and without those that need them."""
         return self.without_each([gone], model or self.best)[0]
 
     def without_each(self, each: Iterable[Sequence[Hypothesis]], model: Weighed) -> list[Weighed]:
-        """The models without some effects or others, side by side."""
+        """The models without some effects or others, weighed again from there if they were in poorer minima before."""
         asked, tasks = list[frozenset[str]](), dict[frozenset[str], Callable[[], Weighed]]()
         for listed in each:
             lost = {h.effect.name for h in listed if not has_effect(self.first.problem.model, h.effect.name)}
@@ -269,8 +266,7 @@ def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
 def _problem_without(problem: Problem, gone: Sequence[Hypothesis], first: Fit) -> Problem:
     """The problem without the coefficients of some effects, and without effects that then no coefficient moves.
 
-    An effect of the first fit's model stays, and so does one whose deviations between tracks, or whose value for all of
-    them, was named too.
+    An effect of the first fit's model stays, and one whose value for all tracks, or deviations between them, is named.
     """
     lost = {column for h in gone for column in h.columns}
     deviations = {n: d for n, d in problem.deviations.items() if n not in lost}

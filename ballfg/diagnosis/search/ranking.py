@@ -21,18 +21,12 @@ from ballfg.tracks import TABLE_TENNIS
 
 
 def finding_of(
-    hypothesis: Hypothesis,
-    model: Weighed,
-    without: Weighed,
-    odds: Odds,
-    scored: Sequence[Scored],
+    hypothesis: Hypothesis, model: Weighed, without: Weighed, odds: Odds, scored: Sequence[Scored]
 ) -> Finding:
     """A named effect with its evidence.
 
-    Args:
-        model, without: the most probable model, and the same without the effect.
-        odds: of all models.
-        scored: of the round that added it.
+    Args: model, without: the most probable model, and the same without the effect.  odds: of all models.  scored: of
+        the round that added it.
     """
     values = fitted_values(model.fit, hypothesis)
     if hypothesis.name in model.strengths and not hypothesis.deviations():
@@ -64,8 +58,7 @@ def finding_of(
 def _by_chance(hypothesis: Hypothesis, evidence: float, scored: Sequence[Scored]) -> float:
     """The probability of a trace so strong by chance, as its score test says.
 
-    If other effects hide it from the test, its gain beside them counts as a likelihood ratio, which the evidence never
-    exceeds.
+    If other effects hide it from the test, its evidence beside them counts as a likelihood ratio, the least it can be.
     """
     own = next((s for s in scored if s.hypothesis.name == hypothesis.name), None)
     if own is None:

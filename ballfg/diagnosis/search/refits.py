@@ -108,9 +108,7 @@ def refit(before: Fit, scored: Scored) -> Refit:
     A usual effect (friction, say) is also started at its usual strength, for its absence may be a minimum of its own:
     without friction, the fitted spins contradict friction.
 
-    Args:
-        before: the fit without the hypothesis.
-        scored: the hypothesis and its score test.
+    Args: before: the fit without the hypothesis.  scored: the hypothesis and its score test.
     """
     shaped = [replace(scored, hypothesis=shape) for shape in (scored.hypothesis, *scored.shapes)]
     return min((_refit(before, shape) for shape in shaped), key=lambda r: r.fit.cost)
@@ -200,10 +198,9 @@ def _by_likelihood(before: Fit, after: Fit, hypothesis: Hypothesis, taken: float
 
 
 def _narrowness(fitted: Fit) -> float:
-    """Half the log determinant of the information on first states. With the cost it gives the marginal likelihood.
+    """Half the log determinant of the information on first states; with the cost, the marginal likelihood (Laplace).
 
-    With a lift every spin is a degree of freedom of its flight, which also fits noise. This term is its cost, by
-    Laplace's approximation.
+    It is what spins cost that become degrees of freedom of their flights, which also fit noise.
     """
     return 0.5 * float(np.linalg.slogdet(fitted.linearised.start_information)[1].sum())
 

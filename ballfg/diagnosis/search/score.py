@@ -1,15 +1,9 @@
 """Tests by the score whether an absent effect would make the samples more probable, with all else free.
 
-At the minimum of the declared model the derivative of the objective by the coefficients of an absent effect is their
-score. First states are eliminated stretch by stretch, declared coefficients over all tracks. The remaining information
-gives the size of the score by chance. Tracks are the independent units: the scatter of their scores shows how far the
-stated noise can be trusted. False alarms therefore stay as rare as stated when the noise is misjudged or correlated.
-docs/derivations/diagnosis.md has the derivation.
-
-A track with much information on a pattern pulls the estimate towards itself, so that its remaining score scatters too
-little. Uncorrected, false alarms are two to four times as frequent as stated for 12 tracks. Source of the correction:
-R. Bell and D. McCaffrey 2002, "Bias reduction in standard errors for linear regression with multi-stage samples",
-Survey Methodology 28, the estimator known as CR2.
+Tracks are the independent units: the scatter of their scores shows how far the stated noise can be trusted, so that
+false alarms stay as rare as stated. A track pulls the estimate towards itself; R. Bell and D. McCaffrey 2002, "Bias
+reduction in standard errors for linear regression with multi-stage samples", Survey Methodology 28, corrects its score
+for that (CR2). docs/derivations/diagnosis.md has the derivation.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,7 @@
 """Adds effects on stamps, visible in the tracks before any fit, and treats stamps that count kept frames.
 
-A model takes such stamps for a clock that is slow on average. Each of them is off by up to a frame and more, which
-looks like hits, random motion or another spin. Predictions get the stamps of the file, so they have that error as
-noise; the fit and checks of its flights have all frames.
+A model takes such stamps for a slow clock, though each is off by up to a frame and more. Predictions get the stamps of
+the file with that error as noise; the fit and checks of its flights have all frames.
 """
 
 import copy

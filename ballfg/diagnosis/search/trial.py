@@ -27,11 +27,7 @@ MOST_SHAPES = 9  # Largest number of shapes of a hypothesis that are refitted
 PAIR = 2  # Number of hypotheses in the smallest set of several
 
 
-def score_all(
-    model: Weighed,
-    candidates: Sequence[Hypothesis],
-    motion: Motion | None = None,
-) -> list[Scored]:
+def score_all(model: Weighed, candidates: Sequence[Hypothesis], motion: Motion | None = None) -> list[Scored]:
     """Score tests of all hypotheses, and their foretold gains.
 
     Args:
@@ -98,12 +94,7 @@ def try_varying(
 ) -> tuple[list[Scored], list[Attempt]]:
     """Scores every hypothesis of an effect that differs between tracks, and lists the refits of the leading ones.
 
-    Args:
-        model: without any of them.
-        motion: random columns of its fit.
-        catalogue: effects that may differ.
-        known: groupings of the tracks.
-        tell: called with progress.
+    Args: model: without any of them.  motion: random columns of its fit.  known: groupings of the tracks.
     """
     searched = sorted(dict.fromkeys(model.fit.problem.stretches.names), key=place_of)
     listed = offered_varying(model, catalogue, known)
@@ -151,8 +142,8 @@ def _together(screen: Screen, scored: Sequence[Scored], most: int) -> list[Attem
 def _placed(model: Weighed, motion: Motion, closer: Sequence[Varying]) -> Scored:
     """The change along the recording at its best place.
 
-    Several places explain about the same if tracks between them do not show the coefficient. Then an earlier change's
-    place is chosen, since one new table changes several coefficients; else the middle of them.
+    Of several that explain about the same, an earlier change's is chosen, since one new table changes several
+    coefficients; else the middle of them.
     """
     known = {deviation.level for deviation in model.fit.problem.deviations.values()}
     scored = {id(s.hypothesis): s for s in score_all(model, closer, motion)}
@@ -179,7 +170,7 @@ def screen_of(
     varying: Sequence[Varying] = (),
     patterns: Patterns | None = None,
 ) -> Screen:
-    """What foretells a model with further effects, or with others in place of its own; without any, nothing but itself.
+    """What foretells a model with further effects, or with others in place of its own.
 
     Args: as in `try_hypotheses`.  varying: effects that differ by tracks.  patterns: that the model was weighed with.
     """
@@ -204,12 +195,7 @@ def try_hypotheses(
 
     The screen foretells what no refit weighs.
 
-    Args:
-        weighed: the model without any of them.
-        motion: random columns of its fit.
-        catalogue: candidate effects.
-        tell: called with progress.
-        most: largest number of effects in a set.
+    Args: weighed: the model without any of them.  motion: random columns of its fit.  most: effects in a set.
     """
     before, model = weighed.fit, weighed.fit.problem.model
     testable, driven = _offered(weighed, catalogue)

@@ -17,11 +17,13 @@ from ballfg.diagnosis import design_shots, hold_out
 from ballfg.diagnosis.design.choice import combinations, parse_levels
 from ballfg.diagnosis.design.goal import hypothesis_of, separating, shrinking
 from ballfg.diagnosis.design.information import View, planned_flights
-from ballfg.diagnosis.design.plan import ShotPlan, _fit_of_all, _launcher, learn_launcher
+from ballfg.diagnosis.design.plan import ShotPlan, _launcher, learn_launcher
 from ballfg.diagnosis.fit.fit import covariance_of, fit_problem
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.sensitivity import predict
+from ballfg.diagnosis.search.evaluation import on_all
 from ballfg.diagnosis.search.refits import with_hypothesis
+from ballfg.diagnosis.search.stamp_effects import first_fit
 from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.settings import all_settings
@@ -36,7 +38,8 @@ FEW, DESIGNED, RANDOM = 8, 10, 25
 
 def fitted(dataset: Dataset) -> Fit:
     model = nominal_model(dataset.ball)
-    return _fit_of_all(model, hold_out(dataset, model))
+    holdout = hold_out(dataset, model)
+    return on_all(first_fit(model, holdout), holdout.held_out)
 
 
 def error_bars(dataset: Dataset, pair: tuple[str, str]) -> Array:
@@ -127,7 +130,7 @@ def test_a_track_that_begins_late_does_not_say_where_the_launcher_stands(tmp_pat
     dataset = dataset_of(tmp_path / "shots", [*tracks[:4], replace(tracks[4], positions=late), *tracks[5:]])
     model = nominal_model(dataset.ball)
     holdout = hold_out(dataset, model)
-    fit = _fit_of_all(model, holdout)
+    fit = on_all(first_fit(model, holdout), holdout.held_out)
     begins = fit.unknowns.starts[fit.problem.stretches.names.index("004"), :3]
     assert np.linalg.norm(begins - tracks[4].positions[0]) > 0.1
     places = _launcher(fit, holdout.tracks, NAMES).states(GRID)[:, :3]

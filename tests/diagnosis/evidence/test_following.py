@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import ballfg.diagnosis.evidence.weighed as weighing
-from ballfg.diagnosis.evidence.ahead import Ahead
 from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.rows import random_motion
+from ballfg.diagnosis.evidence.sizes import Ahead
 from ballfg.diagnosis.fit.fit import fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit
 

@@ -15,7 +15,7 @@ from scipy import stats
 
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.fit.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
-from ballfg.diagnosis.fit.response import fitted_path, responses
+from ballfg.diagnosis.fit.response import responses
 from ballfg.diagnosis.generic_test import ALARM, PREDICTED
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import Signatures, hypothesis_columns
@@ -177,7 +177,7 @@ def test_every_quantity_of_a_block_differs_over_the_data(calm):
 
 def x_of(fitted):
     """m, along x at the nodes of all arcs."""
-    return np.concatenate([arc.nodes[..., 0].ravel() for arc in responses(fitted, fitted_path(fitted))])
+    return np.concatenate([arc.nodes[..., 0].ravel() for arc in responses(fitted)])
 
 
 def test_where_names_the_largest_part():

@@ -56,7 +56,7 @@ def test_answers_to_forces_are_the_derivatives_by_the_generic_effect(plain):
     wanted = hypothesis_columns(plain, [Hypothesis(GenericFlight, {}, strengths)])
     found = np.zeros_like(wanted)
     centre, reference = torch.tensor((1.4, 0.0, 1.0), dtype=torch.float64), torch.tensor(5.0, dtype=torch.float64)
-    for arc in responses(plain, fitted_path(plain)):
+    for arc in responses(plain):
         flight = Flight(torch.from_numpy(arc.nodes), 0.02)
         axes, place = flight_axes(flight.velocity), flight.position - centre
         world = torch.einsum("ac,mqt->mqcat", torch.eye(3, dtype=torch.float64), place_terms(place))
@@ -72,7 +72,7 @@ def test_answers_to_forces_are_the_derivatives_by_the_generic_effect(plain):
 def test_kicks_move_later_samples_as_a_shot_from_there_does(plain):
     path, stretches = fitted_path(plain), plain.problem.stretches
     arc = path.motion.arcs[1]
-    (after,) = (found for found in responses(plain, path) if found.number == 1)
+    (after,) = (found for found in responses(plain) if found.number == 1)
     step, rows = 1e-4, arc.rows
     since, heights = path.times[:, rows] - arc.begun, stretches.heights[rows, 1:]
     guesses = path.motion.contacts[rows, 1:] - arc.begun[:, None]

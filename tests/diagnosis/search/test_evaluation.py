@@ -14,7 +14,6 @@ from ballfg.diagnosis.search.evaluation import (
     OBSERVED,
     error_of_mean,
     on_all,
-    on_others,
     prediction_errors,
 )
 from ballfg.estimation.settings import Settings
@@ -33,7 +32,7 @@ def others(make_ball, make_launches, make_shots):
 
 def test_the_fit_to_all_tracks_is_that_of_both_halves_at_once(windy, windy_fit, others):
     """From the fit to one half, and the states that go with it on the other."""
-    found = on_all(windy_fit, on_others(windy_fit, others[0]))
+    found = on_all(windy_fit, others[0])
     theirs = replace(others[0], track=others[0].track + len(windy.stretches))
     problem = replace(windy_fit.problem, stretches=joined([windy_fit.problem.stretches, theirs]))
     starts = np.concatenate((windy_fit.problem.stretches.starts.numpy(), theirs.starts.numpy()))
