@@ -25,21 +25,14 @@ LEAST_KICK = 0.3
 
 @dataclass(frozen=True)
 class View:
-    """The view of the cameras on a flight.
+    """The view of the cameras on a flight."""
 
-    Attributes:
-        low, high: (3,) m, corners of the box in which the ball is visible. It is open above: lobs are visible too.
-        duration, interval: s, of the longest flight, and between usable samples on average: a flight will lose as many.
-        sigmas: (3,) m, stated noise of a coordinate.
-        labelled: True if the spin at the first sample is measured.
-    """
-
-    low: Array
-    high: Array
-    duration: float
-    interval: float
-    sigmas: Array
-    labelled: bool
+    low: Array  # (3,) m, corner of the box in which the ball is visible
+    high: Array  # (3,) m, the other one; the box is open above: lobs are visible too
+    duration: float  # s, of the longest flight
+    interval: float  # s, between usable samples on average: a flight will lose as many
+    sigmas: Array  # (3,) m, stated noise of a coordinate
+    labelled: bool  # True if the spin at the first sample is measured
 
     @classmethod
     def of(cls, stretches: Stretches) -> "View":
@@ -122,7 +115,7 @@ MISSED = 1e-3
 class Information:
     """Information matrices about q common unknowns, first states eliminated, in units of the priors."""
 
-    names: tuple[str, ...]  # of the coefficients, which are the first unknowns; launcher settings follow
+    names: tuple[str, ...]  # Of the coefficients, which are the first unknowns; launcher settings follow
     units: Array  # (q,) prior standard deviations, the units of the matrices
     known: Array  # (q, q) of priors and dataset
     shots: Array  # (m, q, q) of each candidate

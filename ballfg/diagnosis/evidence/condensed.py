@@ -10,17 +10,11 @@ from ballfg.diagnosis.evidence.likelihood import LOST, Posterior, Reduced, evide
 
 @dataclass(frozen=True)
 class Condensed:
-    """The likelihood of all tracks, of each half, and of each half with one track more of the other.
+    """The likelihood of all tracks, of each half, and of each half with one track more of the other."""
 
-    Attributes:
-        constant: (n,) what does not depend on the further unknowns, without the square of the residual.
-        gram: (n, k + 1, k + 1) inner products of their columns and the residual, last, over the noise.
-        halves: (t,) which half each track belongs to.
-    """
-
-    constant: Array
-    gram: Array
-    halves: Mask
+    constant: Array  # (n,) what does not depend on the further unknowns, without the square of the residual
+    gram: Array  # (n, k + 1, k + 1) inner products of their columns and the residual, last, over the noise
+    halves: Mask  # (t,) which half each track belongs to
 
     @classmethod
     def of(cls, tracks: Reduced, precision: Array, away: Array, halves: Mask) -> "Condensed":

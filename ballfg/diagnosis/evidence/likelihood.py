@@ -46,15 +46,10 @@ class Noise:
 
 @dataclass(frozen=True)
 class Reduced:
-    """The likelihood without first states and random motion, quadratic in the common unknowns.
+    """The likelihood without first states and random motion, quadratic in the common unknowns."""
 
-    Attributes:
-        constant: (n,) what does not depend on them, without the square of the residual.
-        gram: (n, c + 1, c + 1) inner products of common columns and the residual, last, over the noise.
-    """
-
-    constant: Array
-    gram: Array
+    constant: Array  # (n,) what does not depend on them, without the square of the residual
+    gram: Array  # (n, c + 1, c + 1) inner products of common columns and the residual, last, over the noise
 
     def by_track(self, track: Index) -> "Reduced":
         """Summed over the stretches of each track; track: (n,) their numbers."""
@@ -68,15 +63,10 @@ class Reduced:
 
 @dataclass(frozen=True)
 class Local:
-    """The eliminated unknowns of each stretch.
+    """The eliminated unknowns of each stretch."""
 
-    Attributes:
-        lower: (n, l, l) triangle of the information on first states and random motion.
-        solved: (n, c + 1, l) inner products of common columns and the residual with them, over the triangle.
-    """
-
-    lower: Array
-    solved: Array
+    lower: Array  # (n, l, l) triangle of the information on first states and random motion
+    solved: Array  # (n, c + 1, l) inner products of common columns and the residual with them, over the triangle
 
 
 @dataclass(frozen=True)
@@ -106,18 +96,12 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Inner products of the rows of one batch under some robust weights.
+    """Inner products of the rows of one batch under some robust weights."""
 
-    Attributes:
-        rows: of a fit.
-        samples, spins: (n, k) and (n,) robust weights.
-        penalty: (n,) their cost.
-    """
-
-    rows: Rows
-    samples: Array
-    spins: Array
-    penalty: Array
+    rows: Rows  # Of a fit
+    samples: Array  # (n, k) robust weights
+    spins: Array  # (n,) robust weights
+    penalty: Array  # (n,) their cost
 
     @cached_property
     def spin_columns(self) -> Array:

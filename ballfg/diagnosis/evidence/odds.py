@@ -15,13 +15,10 @@ SURELY = 2.0  # Standard errors by which the gain on the other half must fall sh
 
 @dataclass(frozen=True)
 class Odds:
-    """Probabilities of the models that were weighed.
-
-    Attributes:
-        models: probability by the names of the effects in it, with `NAMELESS` for patterns without a name.
-    """
+    """Probabilities of the models that were weighed."""
 
     models: Mapping[frozenset[str], float] = field(default_factory=dict)
+    """Probability by the names of the effects in it, with `NAMELESS` for patterns without a name."""
 
     def of(self, name: str) -> float:
         """Probability that an effect is there."""

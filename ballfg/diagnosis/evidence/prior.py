@@ -85,18 +85,13 @@ WIDTH_ROUNDS: Final = 2  # Number of turns in which each effect gets its most pr
 
 @dataclass(frozen=True)
 class Priors:
-    """Normal priors of the common unknowns of a fit, with widths for the strengths of its named effects.
+    """Normal priors of the common unknowns of a fit, with widths for the strengths of its named effects."""
 
-    Attributes:
-        base: (c,) precision of the others, zero for strengths.
-        away: (c,) prior mean less present value.
-        places, sizes: for each effect, then for each block of patterns, where its strengths are and their usual sizes.
-    """
-
-    base: Array
-    away: Array
+    base: Array  # (c,) precision of the others, zero for strengths
+    away: Array  # (c,) prior mean less present value
     places: tuple[Index, ...]
-    sizes: tuple[Array, ...]
+    """Where the strengths of each effect, then those of each block of patterns, are."""
+    sizes: tuple[Array, ...]  # Their usual sizes
 
     @classmethod
     def of(cls, fit: Fit, named: Sequence[Hypothesis], patterns: Patterns | None = None) -> "Priors":

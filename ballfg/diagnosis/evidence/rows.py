@@ -31,28 +31,18 @@ SIZES: Final = (ACCELERATION, CONTACT_VELOCITY, CONTACT_SPIN, 1.0)
 
 @dataclass(frozen=True)
 class Motion:
-    """Random columns of n stretches, batch by batch as in `batches_of`.
+    """Random columns of n stretches, batch by batch as in `batches_of`."""
 
-    Attributes:
-        columns: (b, m, r) derivatives at the unit of each kind, zero where a stretch has fewer.
-        kinds: (b, r) kind of each column, -1 for none.
-    """
-
-    columns: tuple[Array, ...]
-    kinds: tuple[Index, ...]
+    columns: tuple[Array, ...]  # (b, m, r) derivatives at the unit of each kind, zero where a stretch has fewer
+    kinds: tuple[Index, ...]  # (b, r) kind of each column, -1 for none
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Stretches of similar length: one long stretch would pad all others to its own.
+    """Stretches of similar length: one long stretch would pad all others to its own."""
 
-    Attributes:
-        numbers: (b,) of its stretches among all.
-        rows: (m,) numbers of the rows of their samples, then of their spins, among all rows.
-    """
-
-    numbers: Index
-    rows: Index
+    numbers: Index  # (b,) of its stretches among all
+    rows: Index  # (m,) numbers of the rows of their samples, then of their spins, among all rows
 
     def of(self, columns: Array) -> Array:
         """(b, m, ...) the part of columns (n, 3 k + 3, ...)."""
@@ -67,27 +57,16 @@ def batches_of(used: Mask) -> list[Batch]:
 
 @dataclass(frozen=True)
 class Rows:
-    """Whitened rows of a batch of b stretches without robust weights: three for each of k samples, then three for spin.
+    """Whitened rows of b stretches without robust weights: three for each of k samples, then three for the spin."""
 
-    Attributes:
-        numbers: (b,) of the stretches among all.
-        residual: (b, m) measured minus predicted.
-        by_start: (b, m, 9) derivatives by the first state.
-        by_common: (b, m, q) by the unknowns that all stretches share.
-        random: (b, m, r) the random columns.
-        kinds: (b, r) kind of each, -1 for none.
-        used: (b, k) samples that there are.
-        labelled: (b,) True where the spin rows compare with a label.
-    """
-
-    numbers: Index
-    residual: Array
-    by_start: Array
-    by_common: Array
-    random: Array
-    kinds: Index
-    used: Mask
-    labelled: Mask
+    numbers: Index  # (b,) of the stretches among all
+    residual: Array  # (b, m) measured minus predicted
+    by_start: Array  # (b, m, 9) derivatives by the first state
+    by_common: Array  # (b, m, q) by the unknowns that all stretches share
+    random: Array  # (b, m, r) the random columns
+    kinds: Index  # (b, r) kind of each, -1 for none
+    used: Mask  # (b, k) samples that there are
+    labelled: Mask  # (b,) True where the spin rows compare with a label
 
     @property
     def counts(self) -> Array:

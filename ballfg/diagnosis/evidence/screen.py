@@ -32,21 +32,14 @@ Gone = tuple[int, ...]  # Places of the model's own effects with strengths that 
 
 @dataclass(frozen=True)
 class Screen:
-    """Inner products of a model's common unknowns and of the strengths of all candidates.
+    """Inner products of a model's common unknowns and of the strengths of all candidates."""
 
-    Attributes:
-        model: without the candidates.
-        candidates: the hypotheses.
-        tracks: of each track, with the columns of their strengths last, first states and random motion integrated out.
-        total: summed over the tracks.
-        priors: of the model's own common unknowns.
-    """
-
-    model: Weighed
+    model: Weighed  # Without the candidates
     candidates: Sequence[Hypothesis]
     tracks: Reduced
-    total: Reduced
-    priors: Priors
+    """Of each track, with the columns of their strengths last, first states and random motion integrated out."""
+    total: Reduced  # Summed over the tracks
+    priors: Priors  # Of the model's own common unknowns
     _known: "dict[tuple[Beside, int, Gone], _Gain]" = field(default_factory=dict)
     _condensed: dict[Gone, Condensed] = field(default_factory=dict)
 

@@ -40,19 +40,12 @@ class Strengths:
 
 @dataclass(frozen=True)
 class Weight:
-    """What decides about a model: as weighed, or as another one's linearisation foretells it.
+    """What decides about a model: as weighed, or as another one's linearisation foretells it."""
 
-    Attributes:
-        evidence: logarithm, natural units, up to a constant that all models of the same tracks share.
-        odds: logarithm of the prior odds.
-        held_out: (t,) logarithm of the density of each track, with coefficients of the other half.
-        prior: logarithm of the density of all coefficients by their priors, over that at the priors' means.
-    """
-
-    evidence: float
-    odds: float
-    held_out: Array
-    prior: float
+    evidence: float  # Logarithm, natural units, up to a constant that all models of the same tracks share
+    odds: float  # Logarithm of the prior odds
+    held_out: Array  # (t,) logarithm of the density of each track, with coefficients of the other half
+    prior: float  # Logarithm of the density of all coefficients by their priors, over that at the priors' means
 
     @property
     def score(self) -> float:

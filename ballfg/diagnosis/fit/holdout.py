@@ -38,31 +38,19 @@ class EvaluationTrack:
 
 @dataclass(frozen=True)
 class Holdout:
-    """A dataset in two halves.
+    """A dataset in two halves."""
 
-    Attributes:
-        dataset: the whole.
-        settings: its noise, as stated or estimated.
-        surfaces: where its balls bounce.
-        launcher: names the labels of a shot that give its spin; its weights are not used.
-        search, held_out: stretches of the two halves.
-        search_tracks, held_out_tracks: tracks of the two halves up to their first hit.
-        tracks: of both halves, whole and in the order of the recording.
-        stamps: errors of the stamps of all tracks; the stretches have corrected frames.
-        excluded: sentences on unused tracks.
-    """
-
-    dataset: Dataset
-    settings: Settings
-    surfaces: Surfaces
-    launcher: Launcher
-    search: Stretches
-    held_out: Stretches
-    search_tracks: tuple[EvaluationTrack, ...]
-    held_out_tracks: tuple[EvaluationTrack, ...]
-    tracks: tuple[Track, ...]
-    stamps: Stamps
-    excluded: tuple[str, ...]
+    dataset: Dataset  # The whole
+    settings: Settings  # Its noise, as stated or estimated
+    surfaces: Surfaces  # Where its balls bounce
+    launcher: Launcher  # Names the labels of a shot that give its spin; its weights are not used
+    search: Stretches  # Of the search half
+    held_out: Stretches  # Of the other half
+    search_tracks: tuple[EvaluationTrack, ...]  # Of the search half, up to their first hit
+    held_out_tracks: tuple[EvaluationTrack, ...]  # Of the other half, up to their first hit
+    tracks: tuple[Track, ...]  # Of both halves, whole and in the order of the recording
+    stamps: Stamps  # Errors of the stamps of all tracks; the stretches have corrected frames
+    excluded: tuple[str, ...]  # Sentences on unused tracks
 
 
 def analytic(model: BallModel) -> AnalyticModel:

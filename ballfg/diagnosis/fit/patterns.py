@@ -45,21 +45,13 @@ LEAST_SCATTER = 1e-6  # In the unit of a quantity. Smaller scatter is rounding: 
 
 @dataclass(frozen=True)
 class Block:
-    """p columns: f quantities along a axes (3 in space), axis by axis.
+    """p columns: f quantities along a axes (3 in space), axis by axis."""
 
-    Attributes:
-        kind: `flight`, `contact`, `measurement` or `recording`.
-        quantities: (f,) in words.
-        axes: (a,) in words.
-        values: (m, f) of the quantities where the pattern acts.
-        columns: (n, 3 k + 3, a f) whitened responses of the samples.
-    """
-
-    kind: str
-    quantities: Names
-    axes: Names
-    values: Array
-    columns: Array
+    kind: str  # `flight`, `contact`, `measurement` or `recording`
+    quantities: Names  # (f,) in words
+    axes: Names  # (a,) in words
+    values: Array  # (m, f) of the quantities where the pattern acts
+    columns: Array  # (n, 3 k + 3, a f) whitened responses of the samples
 
 
 def blocks_of(fit: Fit) -> list[Block]:

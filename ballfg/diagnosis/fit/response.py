@@ -45,31 +45,18 @@ class FittedPath:
 
 @dataclass(frozen=True)
 class ArcResponse:
-    """Responses of m stretches to forces and kicks in one of their arcs, with q nodes and k samples.
+    """Responses of m stretches to forces and kicks in one of their arcs, with q nodes and k samples."""
 
-    Attributes:
-        rows: (m,) numbers of the stretches.
-        number: of the arc: 0 is before the first contact, j follows contact j - 1.
-        begun: (m,) s since the first sample.
-        step: (m,) s between nodes.
-        incoming: (m, 9) state before the arc's first contact; the first state itself for arc 0.
-        nodes: (m, q, 9) states.
-        times: (m, q) s of the nodes since the first sample.
-        inverse: (m, q, 9, 3) of the derivative of a node's state by the arc's first state, columns of the velocity.
-        positions: (m, k, 3, 9) m, derivative of the measured positions by the arc's first state; zero before it.
-        passed: (m, k) number of nodes before each sample.
-    """
-
-    rows: Index
-    number: int
-    begun: Array
-    step: Array
-    incoming: Array
-    nodes: Array
-    times: Array
-    inverse: Array
-    positions: Array
-    passed: Index
+    rows: Index  # (m,) numbers of the stretches
+    number: int  # Of the arc: 0 is before the first contact, j follows contact j - 1
+    begun: Array  # (m,) s since the first sample
+    step: Array  # (m,) s between nodes
+    incoming: Array  # (m, 9) state before the arc's first contact; the first state itself for arc 0
+    nodes: Array  # (m, q, 9) states
+    times: Array  # (m, q) s of the nodes since the first sample
+    inverse: Array  # (m, q, 9, 3) of the derivative of a node's state by the arc's first state, columns of the velocity
+    positions: Array  # (m, k, 3, 9) m, derivative of the measured positions by the arc's first state; zero before it
+    passed: Index  # (m, k) number of nodes before each sample
 
     def response_to(self, acceleration: Array) -> Array:
         """(m, k, 3, p) m by which accelerations (m, q, 3, p) m/s^2 at the nodes move the measured positions."""
@@ -196,21 +183,14 @@ CONTACT_VELOCITY, CONTACT_SPIN = 0.2, 20.0  # m/s and rad/s, priors of the kicks
 
 @dataclass(frozen=True)
 class Piece:
-    """Free kicks of one arc of one stretch: three columns for each of b bins, then six for a contact before the arc.
+    """Free kicks of one arc of one stretch: three columns for each of b bins, then six for a contact before the arc."""
 
-    Attributes:
-        columns: (m, d) whitened responses.
-        sigma: (d,) priors.
-        times: (b,) s.
-        states: (b, 9).
-        contact: None for a first arc; else number of the contact, its time, the state before it.
-    """
-
-    columns: Array
-    sigma: Array
-    times: Array
-    states: Array
+    columns: Array  # (m, d) whitened responses
+    sigma: Array  # (d,) priors
+    times: Array  # (b,) s
+    states: Array  # (b, 9)
     contact: tuple[int, float, Array] | None
+    """None for a first arc; else number of the contact, its time, the state before it."""
 
 
 def free_motion(fit: "Fit", arc: ArcResponse) -> list[Piece]:

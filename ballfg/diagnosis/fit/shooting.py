@@ -28,21 +28,13 @@ LEAST_ARC = 1e-3  # s. Least duration of an arc between two contacts for the cho
 
 @dataclass(frozen=True)
 class Arc:
-    """Flight of some rows from one contact to the next.
+    """Flight of some rows from one contact to the next."""
 
-    Attributes:
-        rows: (m,) their numbers.
-        begun: (m,) s, beginning of each.
-        step: (m, 1) s.
-        nodes: (j + 1, m, 9) states.
-        slopes: (j + 1, m, 9) their derivatives by time.
-    """
-
-    rows: Tensor
-    begun: Tensor
-    step: Tensor
-    nodes: Tensor
-    slopes: Tensor
+    rows: Tensor  # (m,) their numbers
+    begun: Tensor  # (m,) s, beginning of each
+    step: Tensor  # (m, 1) s
+    nodes: Tensor  # (j + 1, m, 9) states
+    slopes: Tensor  # (j + 1, m, 9) their derivatives by time
 
     def states(self, times: Tensor) -> Tensor:
         """(k, m, 9) states at times (k, m) s; beyond the last node by the last polynomial."""

@@ -34,31 +34,18 @@ PADDING = {"sigmas": math.inf, "heights": math.nan, "contacts": math.nan}
 
 @dataclass(frozen=True)
 class Stretches:
-    """n stretches of at most k samples and c contacts each, padded.
+    """n stretches of at most k samples and c contacts each, padded."""
 
-    Attributes:
-        names: of the tracks they come from.
-        track: (n,) number of the track: stretches of one track count as one observation.
-        settings: (n, s) launcher settings, zero if a stretch does not start at the launcher or has none.
-        times: (n, k) s since the stretch's first sample; the last one repeated.
-        positions: (n, k, 3) m as measured.
-        sigmas: (n, k, 3) m, stated noise; infinite for padding.
-        starts: (n, 9) first guess of the state at the first sample.
-        heights: (n, c) m, declared height of each contact's surface in order of time; NaN for padding.
-        contacts: (n, c) s, guesses of their times.
-        labels: (n, 3) rad/s, spin label at the first sample; NaN without one.
-    """
-
-    names: tuple[str, ...]
-    track: Index
-    settings: Array
-    times: Tensor
-    positions: Tensor
-    sigmas: Tensor
-    starts: Tensor
-    heights: Tensor
-    contacts: Tensor
-    labels: Tensor
+    names: tuple[str, ...]  # Of the tracks they come from
+    track: Index  # (n,) number of the track: stretches of one track count as one observation
+    settings: Array  # (n, s) launcher settings, zero if a stretch does not start at the launcher or has none
+    times: Tensor  # (n, k) s since the stretch's first sample; the last one repeated
+    positions: Tensor  # (n, k, 3) m as measured
+    sigmas: Tensor  # (n, k, 3) m, stated noise; infinite for padding
+    starts: Tensor  # (n, 9) first guess of the state at the first sample
+    heights: Tensor  # (n, c) m, declared height of each contact's surface in order of time; NaN for padding
+    contacts: Tensor  # (n, c) s, guesses of their times
+    labels: Tensor  # (n, 3) rad/s, spin label at the first sample; NaN without one
 
     def __len__(self) -> int:
         return len(self.names)

@@ -15,15 +15,10 @@ from ballfg.state import STATE_DIM
 
 @dataclass(frozen=True)
 class Eliminated:
-    """A system without its first states.
+    """A system without its first states."""
 
-    Attributes:
-        solved: (n, 9, q + 1) first states that absorb each column, the residual last.
-        left: (n, m, q + 1) what they leave of each column, turned.
-    """
-
-    solved: Array
-    left: Array
+    solved: Array  # (n, 9, q + 1) first states that absorb each column, the residual last
+    left: Array  # (n, m, q + 1) what they leave of each column, turned
 
     @cached_property
     def gram(self) -> Array:
@@ -50,17 +45,11 @@ class Eliminated:
 
 @dataclass(frozen=True)
 class System:
-    """Whitened rows of n stretches: m is the number of samples' coordinates plus three for the spin.
+    """Whitened rows of n stretches: m is the number of samples' coordinates plus three for the spin."""
 
-    Attributes:
-        residual: (n, m) measured minus predicted.
-        by_start: (n, m, 9) derivative of the prediction by the first state.
-        by_common: (n, m, q) derivative of the prediction by the unknowns that all stretches share.
-    """
-
-    residual: Array
-    by_start: Array
-    by_common: Array
+    residual: Array  # (n, m) measured minus predicted
+    by_start: Array  # (n, m, 9) derivative of the prediction by the first state
+    by_common: Array  # (n, m, q) derivative of the prediction by the unknowns that all stretches share
 
     @property
     def columns(self) -> Array:

@@ -78,27 +78,16 @@ class RepeatedMotion:
 
 @dataclass(frozen=True)
 class MovedArc:
-    """An arc of n balls with its derivatives in d directions.
+    """An arc of n balls with its derivatives in d directions."""
 
-    Attributes:
-        rows: (n,) numbers of the balls.
-        begun: (n,) s.
-        began: (n, d) its derivatives.
-        step: (n,) s.
-        nodes: (n, j, 9) states.
-        slopes: (n, j, 9) their derivatives by time.
-        nodes_moved: (n, j, 9, d) derivatives of the nodes.
-        slopes_moved: (n, j, 9, d) derivatives of the slopes.
-    """
-
-    rows: Index
-    begun: Array
-    began: Array
-    step: Array
-    nodes: Array
-    slopes: Array
-    nodes_moved: Array
-    slopes_moved: Array
+    rows: Index  # (n,) numbers of the balls
+    begun: Array  # (n,) s
+    began: Array  # (n, d) its derivatives
+    step: Array  # (n,) s
+    nodes: Array  # (n, j, 9) states
+    slopes: Array  # (n, j, 9) their derivatives by time
+    nodes_moved: Array  # (n, j, 9, d) derivatives of the nodes
+    slopes_moved: Array  # (n, j, 9, d) derivatives of the slopes
 
     @classmethod
     def of_dual(cls, arc: Arc, directions: int) -> Self:

@@ -23,18 +23,13 @@ AROUND = 0.1  # s to each side of a contact for the speed before it: offsets of 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An effect that the model may lack, by its class.
-
-    Attributes:
-        shape: coefficients of its form (a centre, a reference), and values that are tried as a whole.
-        strengths: coefficients of its size, for score tests: at their absent values nothing changes.
-        choices: number of shapes among which this one was chosen.
-    """
+    """An effect that the model may lack, by its class."""
 
     effect: type[Effect]
     shape: Mapping[str, float] = field(default_factory=dict)
-    strengths: tuple[str, ...] = ()
-    choices: int = 1
+    """Coefficients of its form (a centre, a reference), and values that are tried as a whole."""
+    strengths: tuple[str, ...] = ()  # Coefficients of its size, for score tests: at their absent values nothing changes
+    choices: int = 1  # Number of shapes among which this one was chosen
 
     @property
     def name(self) -> str:

@@ -49,17 +49,12 @@ class Signatures:
 
 @dataclass(frozen=True)
 class Efficient:
-    """Scores (t, p) of p columns on t tracks, with their information (t, p, p).
-
-    Attributes:
-        prior: (p, p) remaining information of the common columns' priors.
-        raw: (p,) squared length of each column before common columns were projected out.
-    """
+    """Scores (t, p) of p columns on t tracks, with their information (t, p, p)."""
 
     score: Array
     information: Array
-    prior: Array
-    raw: Array
+    prior: Array  # (p, p) remaining information of the common columns' priors
+    raw: Array  # (p,) squared length of each column before common columns were projected out
 
     @property
     def total(self) -> Array:

@@ -32,19 +32,13 @@ PARTS: Final = 8  # Number of parts of a recording after which a change is first
 
 @dataclass(frozen=True)
 class Grouping:
-    """One grouping of tracks.
+    """One grouping of tracks."""
 
-    Attributes:
-        by: the label, or "track" for the place in the recording.
-        weights: by name of a level, the weight (by name of the track) of the level's own deviation.
-        first: name of the first track, of a place in the recording.
-        line: True for a steady change along the recording.
-    """
-
-    by: str
+    by: str  # The label, or "track" for the place in the recording
     weights: Mapping[str, Mapping[str, float]]
-    first: str = ""
-    line: bool = False
+    """By name of a level, the weight (by name of the track) of the level's own deviation."""
+    first: str = ""  # Name of the first track, of a place in the recording
+    line: bool = False  # True for a steady change along the recording
 
     @property
     def suffix(self) -> str:

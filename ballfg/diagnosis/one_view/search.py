@@ -39,22 +39,15 @@ CLOCKS: Final = ("gravity", "buoyancy")
 
 @dataclass(frozen=True)
 class Found:
-    """The end of a search.
+    """The end of a search."""
 
-    Attributes:
-        laws: of the most probable set.  weights: about them.  best: that set.  odds: of all sets.
-        strokes: as estimated with these laws.
-        first: the declared coefficients, fitted without any effect.
-        with_lift: the same and the lift, fitted beside the effects of the set.
-    """
-
-    laws: Laws
-    weights: Weights
-    best: Set
-    odds: Odds
-    strokes: Sequence[Stroke]
-    first: Mapping[str, float]
-    with_lift: Set
+    laws: Laws  # Of the most probable set
+    weights: Weights  # About them
+    best: Set  # That set
+    odds: Odds  # Of all sets
+    strokes: Sequence[Stroke]  # As estimated with these laws
+    first: Mapping[str, float]  # The declared coefficients, fitted without any effect
+    with_lift: Set  # The same and the lift, fitted beside the effects of the set
 
 
 def search(

@@ -36,20 +36,14 @@ BOUNCED: Final = 1.0  # m/s, rise of the vertical velocity that only a bounce ma
 
 @dataclass(frozen=True)
 class Laws:
-    """Laws with values of all strengths that a diagnosis asks about.
+    """Laws with values of all strengths that a diagnosis asks about."""
 
-    Attributes:
-        model: with all effects that are asked about.
-        surfaces, settings: of the estimates.
-        sizes: usual size of each strength, by name: parameters of the model, or of `picture.NAMES`.
-        values: their values.
-    """
-
-    model: AnalyticModel
-    surfaces: Surfaces
-    settings: Settings
+    model: AnalyticModel  # With all effects that are asked about
+    surfaces: Surfaces  # Of the estimates
+    settings: Settings  # Of the estimates
     sizes: Mapping[str, float]
-    values: Mapping[str, float]
+    """Usual size of each strength, by name: parameters of the model, or of `picture.NAMES`."""
+    values: Mapping[str, float]  # Their values
 
     @property
     def picture(self) -> Picture:
@@ -69,18 +63,12 @@ class Laws:
 
 @dataclass(frozen=True)
 class Stroke:
-    """A stroke.
+    """A stroke."""
 
-    Attributes:
-        track: as it was filmed.  clock: of the laws that it was estimated with.
-        estimate: with these laws, at true times.
-        scores: (p,) in the order of the laws' strengths, in one over their usual sizes.
-    """
-
-    track: Track
-    clock: float
-    estimate: Estimate
-    scores: Array
+    track: Track  # As it was filmed
+    clock: float  # Of the laws that it was estimated with
+    estimate: Estimate  # With these laws, at true times
+    scores: Array  # (p,) in the order of the laws' strengths, in one over their usual sizes
 
 
 def estimated(laws: Laws, smoother: Smoother, filmed: Track) -> Stroke | None:

@@ -71,26 +71,18 @@ class Set:
 
 @dataclass(frozen=True)
 class Weights:
-    """A linear model of mean scores.
+    """A linear model of mean scores."""
 
-    Attributes:
-        names: of the p strengths.  sizes: (p,) usual ones.  values: (p,) where the laws have them.
-        absent: (p,) means of their priors: absence, or what the model declares.
-        declared: number of the first strengths, which the model declares and whose priors have the width of their size.
-        mean: (p,) of the scores less that of strokes filmed again.  spread: (p, p) its covariance.
-        slopes: (p, p) of the mean by each strength in usual sizes, column by column.
-        strokes: their number.
-    """
-
-    names: tuple[str, ...]
-    sizes: Array
-    values: Array
-    absent: Array
+    names: tuple[str, ...]  # Of the p strengths
+    sizes: Array  # (p,) usual ones
+    values: Array  # (p,) where the laws have them
+    absent: Array  # (p,) means of their priors: absence, or what the model declares
     declared: int
-    mean: Array
-    spread: Array
-    slopes: Array
-    strokes: int
+    """Number of the first strengths, which the model declares and whose priors have the width of their size."""
+    mean: Array  # (p,) of the scores less that of strokes filmed again
+    spread: Array  # (p, p) its covariance
+    slopes: Array  # (p, p) of the mean by each strength in usual sizes, column by column
+    strokes: int  # Their number
     hypotheses: Sequence[Hypothesis] = ()
     _known: dict[frozenset[str], Set] = field(default_factory=dict)
 

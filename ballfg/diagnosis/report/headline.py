@@ -43,11 +43,11 @@ class Origin:
 
     command: str
     datasets: tuple[str, ...]
-    model: str  # the declared model's file; empty for the nominal model
+    model: str  # The declared model's file; empty for the nominal model
     out: str
     models: tuple[str, ...] = ("model.yaml",)
     """File of the corrected model of each dataset, in the folder `out` of the report."""
-    doubts: tuple[str, ...] = ()  # what is not sure about the tracks
+    doubts: tuple[str, ...] = ()  # What is not sure about the tracks
 
 
 def answer(diagnosis: Diagnosis) -> str:

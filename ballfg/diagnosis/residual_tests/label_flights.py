@@ -31,20 +31,13 @@ MINIMA = (Convergence.CONVERGED, Convergence.AT_KINK)
 
 @dataclass(frozen=True)
 class LabelPosterior:
-    """Spin at the first sample given a label with an error of a given size.
+    """Spin at the first sample given a label with an error of a given size."""
 
-    Attributes:
-        label: (3,) rad/s.
-        error: rad/s, standard deviation per axis of the label's error.
-        log_density: of the label given the samples, up to a constant of the track.
-        mean, covariance: (3,) rad/s, and (3, 3).
-    """
-
-    label: Array
-    error: float
-    log_density: float
-    mean: Array
-    covariance: Array
+    label: Array  # (3,) rad/s
+    error: float  # rad/s, standard deviation per axis of the label's error
+    log_density: float  # Of the label given the samples, up to a constant of the track
+    mean: Array  # (3,) rad/s
+    covariance: Array  # (3, 3)
 
     def log_densities(self, errors: Array) -> Array:
         """Log densities (k,) of the label for other errors (k,) rad/s, with a Gaussian likelihood of the flight."""

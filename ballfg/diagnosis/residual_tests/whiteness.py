@@ -24,20 +24,14 @@ LEAST_FREEDOM = 1e-6  # Least degrees of freedom of a stretch; one whose samples
 
 @dataclass(frozen=True)
 class Whiteness:
-    """The test.
+    """The test."""
 
-    Attributes:
-        p_value: one-sided, corrected for the number of reaches.
-        reach: s, of the most significant kernel.
-        drift: m, root of the mean product of such pairs' errors: the common part of neighbouring samples.
-        explained, spread: for each reach, the sum of U and its standard deviation without drift.
-    """
-
-    p_value: float
-    reach: float
+    p_value: float  # One-sided, corrected for the number of reaches
+    reach: float  # s, of the most significant kernel
     drift: float
-    explained: Array
-    spread: Array
+    """m, root of the mean product of such pairs' errors: the common part of neighbouring samples."""
+    explained: Array  # For each reach, the sum of U
+    spread: Array  # For each reach, its standard deviation without drift
 
     @property
     def where(self) -> str:

@@ -21,27 +21,18 @@ NAMED = 0.9  # Probability above which an effect is named
 
 @dataclass(frozen=True)
 class Search:
-    """The result of a search.
+    """The result of a search."""
 
-    Attributes:
-        first, declared: fit of the declared model to the search half, and that model for predictions.
-        fit, predictive: the same of the model with the named effects.
-        before, judged: prediction errors of both on the judging half.
-        whole: the model with the named effects, fitted to the tracks of both halves.
-        findings, rounds: as in `Diagnosis`.
-        odds: probability of each effect that was weighed.
-    """
-
-    first: Fit
-    declared: AnalyticModel
-    fit: Fit
-    predictive: AnalyticModel
-    before: Errors
-    judged: Errors
-    whole: Fit
+    first: Fit  # Of the declared model to the search half
+    declared: AnalyticModel  # That model for predictions
+    fit: Fit  # Of the model with the named effects to the search half
+    predictive: AnalyticModel  # That model for predictions
+    before: Errors  # Prediction errors of the declared model on the judging half
+    judged: Errors  # Those of the model with the named effects
+    whole: Fit  # The model with the named effects, fitted to the tracks of both halves
     findings: tuple[Finding, ...] = ()
     rounds: tuple[tuple[Candidate, ...], ...] = ()
-    odds: Odds = field(default_factory=Odds)
+    odds: Odds = field(default_factory=Odds)  # Probability of each effect that was weighed
 
 
 @dataclass(frozen=True)

@@ -54,17 +54,11 @@ class Refit:
 
 @dataclass(frozen=True)
 class Attempt:
-    """Refits that may be worth making.
+    """Refits that may be worth making."""
 
-    Attributes:
-        words: names of what they add.
-        gain: foretold logarithm of the odds to the model; infinite if no linearisation can foretell it.
-        refits: what makes them, each with another shape.
-    """
-
-    words: str
-    gain: float
-    refits: Sequence[Callable[[], Refit]]
+    words: str  # Names of what they add
+    gain: float  # Foretold logarithm of the odds to the model; infinite if no linearisation can foretell it
+    refits: Sequence[Callable[[], Refit]]  # What makes them, each with another shape
 
 
 def retested(scored: Sequence[Scored], refits: Sequence[Refit]) -> list[Scored]:

@@ -34,21 +34,13 @@ LARGEST: Final = 1e4  # Squared size, in units of its covariance, that any test 
 
 @dataclass(frozen=True)
 class Pattern:
-    """The test of one pattern.
+    """The test of one pattern."""
 
-    Attributes:
-        rank: r, number of directions tested.
-        estimate: (r,) in those directions, one step from absent.
-        information: (r, r).
-        scatter: (r, r) covariance of the score, from the tracks.
-        p_value: probability by chance.
-    """
-
-    rank: int
-    estimate: Array
-    information: Array
-    scatter: Array
-    p_value: float
+    rank: int  # r, number of directions tested
+    estimate: Array  # (r,) in those directions, one step from absent
+    information: Array  # (r, r)
+    scatter: Array  # (r, r) covariance of the score, from the tracks
+    p_value: float  # Probability by chance
 
     @property
     def explained(self) -> float:
@@ -58,23 +50,14 @@ class Pattern:
 
 @dataclass(frozen=True)
 class Score:
-    """The outcome of a score test.
+    """The outcome of a score test."""
 
-    Attributes:
-        estimate: (p,) coefficients after one step from absent.
-        sigma: (p,) their standard deviations.
-        explained: squared whitened residual that the effect would explain: chi-square of `rank` degrees by chance.
-        p_value: probability by chance.
-        rank: number of directions in which the data show the coefficients.
-        tracks: number of tracks behind the scatter.
-    """
-
-    estimate: Array
-    sigma: Array
-    explained: float
-    p_value: float
-    rank: int
-    tracks: int
+    estimate: Array  # (p,) coefficients after one step from absent
+    sigma: Array  # (p,) their standard deviations
+    explained: float  # Squared whitened residual that the effect would explain: chi-square of `rank` degrees by chance
+    p_value: float  # Probability by chance
+    rank: int  # Number of directions in which the data show the coefficients
+    tracks: int  # Number of tracks behind the scatter
 
     def seen_from(self, alarm: float) -> Array:
         """(p,) detectable sizes of each coefficient, in 9 of 10 cases, whatever the others are.
