@@ -43,10 +43,8 @@ def choose(
 ) -> Choice:
     """Choose so many shots, with repetition.
 
-    Args:
-        sides: coefficients that should be known well, by parameter name.
-        names: of coefficients whose error bars are reported.
-        seed: of the random choices for comparison.
+    Args: sides: coefficients that should be known well, by parameter name.  names: of those whose error bars are
+        reported.  seed: of the random choices for comparison.
     """
     columns = [information.columns(side) for side in sides]
     known, shots = information.known, information.shots

@@ -129,11 +129,8 @@ class Information:
 def information_of(fit: Fit, goal: Goal, starts: Array, settings: Array, surfaces: Surfaces) -> Information:
     """Information on the unknowns from the tracks of a fit and from flights with given first states.
 
-    Args:
-        fit: of the declared model to all tracks.
-        goal: with further unknowns.
-        starts: (m, 9) first states.
-        settings: (m, s) launcher settings, as in the fit's stretches.
+    Args: fit: of the declared model to all tracks.  starts: (m, 9) first states.  settings: (m, s) of the launcher, as
+        in the fit's stretches.
     Raises: ValueError: if no candidate's flight is long enough.
     """
     problem = fit.problem

@@ -29,21 +29,15 @@ LEAST_SHARE = 1e-8
 
 @dataclass(frozen=True)
 class LauncherMap:
-    """First states as a linear function of the settings.
+    """First states as a linear function of the settings."""
 
-    Attributes:
-        names: of s settings, as in labels.
-        weights: (s + 1, 9) of a constant and the settings, for place (m), speed (m/s), azimuth and elevation (rad), and
-            spin about forward, across and up (rad/s).
-        scatter: (9,) standard deviations of the shots about the line, in the same units.
-        low, high: (s,) limits of the measured settings.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # Of s settings, as in labels
     weights: Array
-    scatter: Array
-    low: Array
-    high: Array
+    """(s + 1, 9) of a constant and the settings, for place (m), speed (m/s), azimuth and elevation (rad), and the spin
+    about forward, across and up (rad/s)."""
+    scatter: Array  # (9,) standard deviations of the shots about the line, in the same units
+    low: Array  # (s,) least measured settings
+    high: Array  # (s,) largest ones
 
     def states(self, settings: Array) -> Array:
         """(m, 9) first states of shots with settings (m, s)."""

@@ -20,11 +20,8 @@ class Condensed:
     def of(cls, tracks: Reduced, precision: Array, away: Array, halves: Mask) -> "Condensed":
         """With the first unknowns integrated out.
 
-        Args:
-            tracks: the part of each track.
-            precision: (c,) of the priors of the first unknowns.
-            away: (c,) prior mean less present value.
-            halves: (t,) which half each track belongs to.
+        Args: tracks: the part of each.  precision: (c,) of the priors of the first unknowns.  away: (c,) prior mean
+            less present value.  halves: (t,) which half each track belongs to.
         """
         own = len(precision)
         listed = [tracks.of(np.full(len(halves), True)), tracks.of(~halves), tracks.of(halves)]

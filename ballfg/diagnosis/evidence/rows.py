@@ -84,12 +84,9 @@ class Rows:
     def volume(self) -> Array:
         """(b,) half the log determinant of the information on what has no prior of its own, at the stated noise.
 
-        It is the density of their prior: first places and velocities are uniform in what the samples show of them, and
-        labelled spins in what labels and samples show (H. Jeffreys, "An invariant form for the prior probability in
-        estimation problems", Proc. R. Soc. A 186, 1946). Uniform in metres per second, a slower clock would be more
-        probable than less gravity, which samples alone cannot tell from it, by the cube of its rate for each track; and
-        uniform in radians per second, labels would be the more probable the smaller their scale. Spins without labels
-        have a prior.
+        It is the density of their prior, uniform in what samples and labels show of them (H. Jeffreys, "An invariant
+        form for the prior probability in estimation problems", Proc. R. Soc. A 186, 1946): uniform in metres per
+        second, a slower clock would be more probable than less gravity. Spins without labels have a prior.
         """
         information, diagonal = self.by_start.swapaxes(1, 2) @ self.by_start, np.arange(STATE_DIM)
         information[~self.labelled, SPIN], information[~self.labelled, :, SPIN] = 0.0, 0.0

@@ -93,10 +93,8 @@ class Screen:
     def sets(self, offered: Sequence[int], most: int) -> dict[tuple[int, ...], float]:
         """Sets of up to `most` of the candidates offered, each more probable than all its parts; the best first.
 
-        The values are the logarithms of their posterior odds to the model itself.
-
-        The most probable sets of each size are enlarged by one candidate after the other. What a set gains counts as
-        far as the other half bears it out.
+        The values are the logarithms of their posterior odds to the model itself, as far as the other half bears them
+        out. The most probable sets of each size are enlarged by one candidate after the other.
         """
         found: dict[tuple[int, ...], float] = {(one,): self.odds((one,)) for one in offered}
         best, others = self._leading(found), dict[frozenset[str], Weight]({self.model.names: self.model})

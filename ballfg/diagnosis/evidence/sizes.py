@@ -58,10 +58,8 @@ def settled(
     Not at those to which it leads: a long step leaves the linear range. There are several maxima: noise that a wrong
     model needed can keep a right one from showing that it needs none.
 
-    Args:
-        precision, away: as in `posterior`.
-        starts: of similar models, or None for almost no noise beside that of the samples; the best end counts.
-        own: number of the common unknowns, the first ones, in which the rows are not linear; None: all.
+    Args: precision, away: as in `posterior`.  starts: of similar models, or None for almost no noise beside that of the
+        samples; the best end counts.  own: number of the first unknowns, in which rows are not linear; None: all.
     """
     return climbed([begun(rows, start) for start in starts], precision, away, own)
 
@@ -128,10 +126,9 @@ def slopes_at(
 ) -> Slopes:
     """The derivatives of the evidence by the logarithms of the sizes.
 
-    The slope is expected squares less their number. The expected squares over their variances of all rows and
-    priors add up to the square at the mean plus one for each unknown, so that those of the samples follow from the
-    others. The average of the observed and the expected information needs no traces: A. R. Gilmour, R. Thompson,
-    B. R. Cullis, "Average information REML", Biometrics 51, 1995.
+    The slope is expected squares less their number; those of the samples follow from the others, since all of them add
+    up to the square at the mean plus one for each unknown. The average information needs no traces: A. R. Gilmour,
+    R. Thompson, B. R. Cullis, "Average information REML", Biometrics 51, 1995.
 
     Args: eliminated: of each batch, as `reduced` gives them with the posterior.
     """
@@ -211,17 +208,12 @@ class Ahead:
     """The density of the tracks about the common unknowns of a fit, as far as it is quadratic.
 
     Patterns are no unknowns of the fit: at its new values they are as free as before.
-
-    Attributes:
-        information, slope: (c, c) and (c,) of its logarithm.
-        limits: smallest and largest step (c,).
-        damping: of the next step, as in `bounded_step`.
     """
 
-    information: Array
-    slope: Array
-    limits: tuple[Array, Array]
-    damping: float = 0.0
+    information: Array  # (c, c) of its logarithm
+    slope: Array  # (c,) of its logarithm
+    limits: tuple[Array, Array]  # Smallest and largest step (c,)
+    damping: float = 0.0  # Of the next step, as in `bounded_step`
 
     @classmethod
     def of(cls, fit: Fit, found: Posterior) -> "Ahead":

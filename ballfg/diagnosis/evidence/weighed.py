@@ -62,31 +62,20 @@ class Smaller(Weight):
 
 @dataclass(frozen=True)
 class Weighed(Weight):
-    """A model with its evidence.
+    """A model with its evidence."""
 
-    Attributes:
-        named: effects added to the declared model.
-        fit: to the tracks of both halves.
-        noise: sizes of its noise.
-        weights: robust weights, batch by batch.
-        widths: number of each effect's most probable prior width.
-        strengths: by name of the effect.
-        halves: (t,) which half each track belongs to.
-        nameless: whether it holds patterns without a name as well.
-        nested: the weight of each smaller model, by its names, the rest linearised where it is.
-        neighbours: the same of models with a further effect, or with another one in place of one of its own.
-    """
-
-    named: tuple[Hypothesis, ...]
-    fit: Fit
-    noise: Noise
-    weights: tuple[Weights, ...]
-    widths: tuple[int, ...]
-    strengths: Mapping[str, Strengths]
-    halves: Mask
-    nameless: bool = False
+    named: tuple[Hypothesis, ...]  # Effects added to the declared model
+    fit: Fit  # To the tracks of both halves
+    noise: Noise  # Sizes of its noise
+    weights: tuple[Weights, ...]  # Robust weights, batch by batch
+    widths: tuple[int, ...]  # Number of each effect's most probable prior width
+    strengths: Mapping[str, Strengths]  # By name of the effect
+    halves: Mask  # (t,) which half each track belongs to
+    nameless: bool = False  # Whether it holds patterns without a name as well
     nested: Mapping[frozenset[str], Smaller] = field(default_factory=dict)
+    """The weight of each smaller model, by its names, the rest linearised where it is."""
     neighbours: Mapping[frozenset[str], Weight] = field(default_factory=dict)
+    """The same of models with a further effect, or with another one in place of one of its own."""
 
     @property
     def names(self) -> frozenset[str]:
@@ -138,13 +127,8 @@ def weighed(
     integrated out about the path that comes closest to the samples: about another one, whose distance the motion would
     bridge, flights and bounces are far from linear.
 
-    Args:
-        fit: to the tracks of both halves.
-        named: effects added to the declared model.
-        motion: random columns of this or a similar model.
-        halves: (t,) which half each track belongs to, in the order of the fit's tracks (`unlike_halves`).
-        like: a similar model.
-        patterns: without a name, beside the effects; of this or a similar model.
+    Args: fit: to the tracks of both halves.  motion: random columns of this or a similar model.  halves: (t,) in the
+        order of the fit's tracks (`unlike_halves`).  like: a similar model.  patterns: of this or a similar model.
     """
     with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
         question, closest = _Question(named, motion, halves, patterns), followed(fit, fit.unknowns)

@@ -18,21 +18,14 @@ INEXACT = 0.02
 
 @dataclass(frozen=True)
 class Deviation:
-    """An unknown of a fit: the deviation of a coefficient on some tracks.
+    """An unknown of a fit: the deviation of a coefficient on some tracks."""
 
-    Attributes:
-        coefficient: its parameter name.
-        weights: by name of the track; the coefficient deviates by the unknown times the weight.
-        by, level, line: of the corresponding `Variation` in a model file, and its key there.
-        first: the first track, for a place in the recording: its deviation is zero.
-    """
-
-    coefficient: str
-    weights: Mapping[str, float]
-    by: str
-    level: str
-    first: str = ""
-    line: bool = False
+    coefficient: str  # Its parameter name
+    weights: Mapping[str, float]  # By name of the track; the coefficient deviates by the unknown times the weight
+    by: str  # Of the corresponding `Variation` in a model file
+    level: str  # Its key there
+    first: str = ""  # The first track, for a place in the recording: its deviation is zero
+    line: bool = False  # Of the `Variation`
 
     def along(self, stretches: Stretches) -> Array:
         """(n,) weights of stretches."""

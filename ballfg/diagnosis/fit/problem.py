@@ -50,22 +50,16 @@ class Noise:
 
 @dataclass(frozen=True)
 class Problem:
-    """Data and the model that is fitted to them.
+    """Data and the model that is fitted to them."""
 
-    Attributes:
-        model: with every effect that has a coefficient among `free`.
-        stretches: the data.
-        free: coefficients to estimate, by parameter name, with their priors; deviations by their names.
-        shared: True if coefficients and launcher are estimated. Otherwise only first states are, as in an evaluation on
-            other tracks.
-        deviations: the deviations among `free`, by name.
-    """
-
-    model: AnalyticModel
-    stretches: Stretches
+    model: AnalyticModel  # With every effect that has a coefficient among `free`
+    stretches: Stretches  # The data
     free: Mapping[str, Coefficient]
+    """Coefficients to estimate, by parameter name, with their priors; deviations by their names."""
     shared: bool = True
+    """True if coefficients and launcher are estimated, else only first states, as in an evaluation on other tracks."""
     deviations: Mapping[str, Deviation] = field(default_factory=dict)
+    """The deviations among `free`, by name."""
 
     @property
     def declared(self) -> dict[str, float]:

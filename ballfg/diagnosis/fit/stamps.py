@@ -50,19 +50,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Stamps:
-    """Errors of a dataset's stamps, found before any fit.
+    """Errors of a dataset's stamps, found before any fit."""
 
-    Attributes:
-        missing: average number of missing frames per sample; zero if stamps are times.
-        counted: (n,) s stamps of each track with the missing frames inserted, at the recorded mean rate.
-        scale: recorded durations over true ones less one; zero if the clock is not far off.
-        found: by effect, the evidence on the search half and on the held-out half.
-    """
-
-    missing: float = 0.0
+    missing: float = 0.0  # Average number of missing frames per sample; zero if stamps are times
     counted: Mapping[str, Array] = field(default_factory=dict)
-    scale: float = 0.0
+    """(n,) s stamps of each track with the missing frames inserted, at the recorded mean rate."""
+    scale: float = 0.0  # Recorded durations over true ones less one; zero if the clock is not far off
     found: Mapping[str, tuple[Evidence, Evidence]] = field(default_factory=dict)
+    """By effect, the evidence on the search half and on the held-out half."""
 
     @property
     def stretch(self) -> float:

@@ -30,10 +30,7 @@ class Eliminated:
     def common_step(self, precision: Array, pull: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
         """(q,) best step of the common unknowns within limits.
 
-        Args:
-            precision: (q,) of the priors.
-            pull: (q,) prior mean minus present value, times the precision.
-            low, high, damping: as in `bounded_step`.
+        Args: precision: (q,) of the priors.  pull: (q,) prior mean minus present value, times the precision.
         """
         total = self.gram.sum(axis=0)
         return bounded_step(total[:-1, :-1] + np.diag(precision), total[:-1, -1] + pull, low, high, damping)

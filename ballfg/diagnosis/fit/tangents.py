@@ -39,11 +39,7 @@ def make_dual(primal: Tensor, tangent: Tensor) -> Tensor:
 class RepeatedMotion:
     """The motion of n balls, each repeated for d directions of a derivative, direction by direction.
 
-    Args:
-        arcs: of the motion.
-        balls: n.
-        directions: d.
-        parts: 3; or 1 for positions alone, with states (n, k, 3).
+    Args: balls: n.  directions: d.  parts: 3; or 1 for positions alone, with states (n, k, 3).
     """
 
     def __init__(self, arcs: "Sequence[MovedArc]", balls: int, directions: int, parts: int) -> None:
@@ -157,14 +153,7 @@ def shoot_compiled(
 ) -> MovedShot:
     """The motion of n balls, as `shooting.shoot`, with its derivatives in d directions.
 
-    Args:
-        model: the functions of an analytic model.
-        coefficients: of each ball.
-        start: (n, 9) at time 0.
-        moved: (n, 9, d) its derivatives.
-        heights: (n, c) m, declared heights of the surfaces in order of contact; NaN after the last.
-        guesses: (n, c) s, approximate times of contact.
-        ends: (n,) s, durations.
+    Args: start: (n, 9) at time 0.  moved: (n, 9, d) its derivatives.  heights, guesses, ends: as of `shoot`.
     """
     n, _, d = moved.shape
     rows, begun, began = np.arange(n, dtype=np.int64), np.zeros(n), np.zeros((n, d))

@@ -38,25 +38,17 @@ def clipped(scores: Array) -> Array:
 
 @dataclass(frozen=True)
 class Set:
-    """A set of effects, weighed.
+    """A set of effects, weighed."""
 
-    Attributes:
-        names: of its effects.
-        evidence: logarithm of the density of the mean scores, up to a constant. Laws that lack what scatters from
-            stroke to stroke have a wide one.
-        odds: the same with the prior odds of the effects.
-        unknown: names of the q strengths of the set, with the declared coefficients first.
-        values, covariance: (q,), (q, q) of them.
-        misfit: chi-square of the scores about them.
-    """
-
-    names: frozenset[str]
+    names: frozenset[str]  # Of its effects
     evidence: float
-    odds: float
-    unknown: tuple[str, ...]
-    values: Array
-    covariance: Array
-    misfit: float
+    """Logarithm of the density of the mean scores, up to a constant. Laws that lack what scatters from stroke to stroke
+    have a wide one."""
+    odds: float  # The same with the prior odds of the effects
+    unknown: tuple[str, ...]  # Names of the q strengths of the set, with the declared coefficients first
+    values: Array  # (q,) of them
+    covariance: Array  # (q, q) of them
+    misfit: float  # Chi-square of the scores about them
 
     @property
     def sigmas(self) -> Array:
@@ -213,10 +205,7 @@ def mean_of(real: Array, again: Sequence[Array]) -> tuple[Array, Array]:
     """Mean of the scores, and its covariance, as of `Weights`.
 
     The covariance has the shape of that of strokes filmed again, of which there are more, and the size of the real
-    ones' where that is larger: what the laws lack scatters from stroke to stroke too.
-
-    Args:
-        real: (n, p).  again: of strokes filmed again with the laws.
+    ones' (n, p) where that is larger: what the laws lack scatters from stroke to stroke too.
     """
     found, others = clipped(real), [clipped(one) for one in again]
     middle = np.mean([one.mean(axis=0) for one in others], axis=0)

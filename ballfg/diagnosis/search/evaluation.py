@@ -231,9 +231,8 @@ def without_population(model: AnalyticModel) -> AnalyticModel:
 def predictive_model(holdout: Holdout, jobs: int, fit: Fit) -> AnalyticModel:
     """The fitted model with its own noise on the search half, and with its population of spins if that predicts better.
 
-    A model that lacks an effect has too much noise for the corrected one; with that noise predictions hardly follow the
-    observed part, and an effect's gain would depend on the errors of the others. Spins that such a model needs differ
-    from flight to flight more than those of a launcher: a population may then be worse than the prior of any spin.
+    With the noise of a model that lacks an effect, predictions would hardly follow the observed part. Spins that such a
+    model needs differ from flight to flight more than a launcher's: a population may be worse than the prior of any.
     """
     model = next_shot_model(fit, holdout.launcher.embedding)
     model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=jobs)

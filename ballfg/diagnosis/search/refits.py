@@ -73,10 +73,7 @@ def retested(scored: Sequence[Scored], refits: Sequence[Refit]) -> list[Scored]:
 def refit_set(before: Fit, chosen: Sequence[Scored], step: Array, strengths: Array) -> Refit:
     """The fit with several hypotheses at the most probable unknowns of the linearised model.
 
-    Args:
-        before: the fit without them.
-        chosen: the hypotheses and their score tests.
-        step, strengths: as `Screen.step` gives them: a process for the fit then needs no screen, which is large.
+    Args: step, strengths: as `Screen.step` gives them: a process for the fit then needs no screen, which is large.
     """
     problem, listed = before.problem, [one.hypothesis for one in chosen]
     for hypothesis in listed:
@@ -209,11 +206,8 @@ def delta_bic(before: Fit, after: Fit) -> float:
 def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
     """The frames of the labels, with other axes or signs, that agree best with the flights.
 
-    Such a change is too large for a score test. Spins are estimated from the flights alone, without labels and with the
-    declared coefficients, because coefficients fitted to wrong labels would be wrong too. The best frames are then
-    fitted in full.
-
-    Args: before: the fit so far.  general: the hypothesis of any other frame.
+    Such a change is too large for a score test. Spins are estimated from the flights alone, with the declared
+    coefficients: those fitted to wrong labels would be wrong too.  Args: general: the hypothesis of any other frame.
     """
     spins, covariances, labels = _spins_without_labels(before)
     frames = signed_permutations().numpy()[1:]
