@@ -63,15 +63,6 @@ def groupings(tracks: Sequence[Track], searched: Sequence[str]) -> list[Grouping
     return [*found, *_by_place([track.name for track in tracks], searched)]
 
 
-def steps_near(grouping: Grouping, searched: Sequence[str], names: Sequence[str]) -> list[Grouping]:
-    """A step moved to every track of the search half that is nearest to it; other groupings stay."""
-    if grouping.by != TRACK or grouping.line:
-        return [grouping]
-    reach, at = max(1, len(searched) // PARTS), searched.index(next(iter(grouping.weights)))
-    begins = range(max(LEAST_TRACKS, at - reach), min(len(searched) - LEAST_TRACKS, at + reach) + 1)
-    return [_step(names, searched[begin]) for begin in begins]
-
-
 def _by_place(names: Sequence[str], searched: Sequence[str]) -> list[Grouping]:
     """Steps and a line; none if names do not give the order of the recording."""
     places = [place_of(name) for name in names]
@@ -213,10 +204,13 @@ def varying_hypotheses(
 
 
 def near(hypothesis: Varying, searched: Sequence[str], names: Sequence[str]) -> list[Varying]:
-    """The hypothesis with its step at every nearby place; itself without a step."""
-    coefficients = tuple(dict.fromkeys(varied(s) for s in hypothesis.strengths))
-    ways = steps_near(hypothesis.grouping, searched, names)
-    return [Varying.of(hypothesis.effect, coefficients, way) for way in ways]
+    """The hypothesis with its step at every nearby track of the search half; itself without a step."""
+    grouping, coefficients = hypothesis.grouping, tuple(dict.fromkeys(varied(s) for s in hypothesis.strengths))
+    if grouping.by != TRACK or grouping.line:
+        return [hypothesis]
+    reach, at = max(1, len(searched) // PARTS), searched.index(next(iter(grouping.weights)))
+    begins = range(max(LEAST_TRACKS, at - reach), min(len(searched) - LEAST_TRACKS, at + reach) + 1)
+    return [Varying.of(hypothesis.effect, coefficients, _step(names, searched[begin])) for begin in begins]
 
 
 def varied(strength: str) -> str:

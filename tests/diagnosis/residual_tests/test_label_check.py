@@ -14,11 +14,13 @@ from ballfg.diagnosis.residual_tests.label_check import (
     RIGHT_SPREAD,
     SHARES,
     WRONG,
+    LabelledFlight,
+    LabelPosterior,
     _mixture,
     judged,
     label_test,
+    wrong_error,
 )
-from ballfg.diagnosis.residual_tests.label_flights import LabelledFlight, LabelPosterior, wrong_error
 
 STATED, FAR = 4.0, 120.0
 """rad/s, errors of labels that are right and wrong."""

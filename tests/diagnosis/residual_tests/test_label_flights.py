@@ -9,8 +9,7 @@ import pytest
 
 from ballfg.diagnosis import hold_out
 from ballfg.diagnosis.hypotheses.hypothesis import with_effects
-from ballfg.diagnosis.residual_tests.label_check import scattering_model
-from ballfg.diagnosis.residual_tests.label_flights import labelled_flights
+from ballfg.diagnosis.residual_tests.label_check import labelled_flights, scattering_model
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.effects.measurement import SpinLabelScale
 from ballfg.estimation import Settings, Smoother
