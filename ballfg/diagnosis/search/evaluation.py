@@ -23,7 +23,7 @@ from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients, with_effects
 from ballfg.diagnosis.result import Errors, PredictedPath
 from ballfg.dynamics import AnalyticModel, BallModel, Surfaces
-from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.coefficient import coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.dynamics.trained import Trained
