@@ -10,13 +10,13 @@ from torch import Tensor
 from ballfg.arrays import Array, Index
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_change import CHANGES, ZOOM, seen_at, slopes_of
+from ballfg.vision.projection import CHANGES, ZOOM, seen_at, slopes_of
 
 
 class UncertainCameraFactors(CameraFactors):
     """Camera factors with the changes of their cameras among the coefficients.
 
-    A camera's change (`ballfg.vision.camera_change`) is L z, L L^T its covariance, with seven coefficients z whose
+    A camera's change (`ballfg.vision.projection`) is L z, L L^T its covariance, with seven coefficients z whose
     prior has the standard deviation 1.
 
     Args: cameras: of the bank.  places: (c,) index of the first of each camera's coefficients, or `FIXED`.

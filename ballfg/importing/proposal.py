@@ -18,15 +18,14 @@ from ballfg.importing.columns import UNMEASURED, Roles
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.sources import tables_of
 from ballfg.importing.frame import TURNS, Frame, find_frame
-from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels
+from ballfg.importing.gathering import MOST_SHOTS, relative, shots_of, split, understood, with_labels, with_spins
 from ballfg.importing.several_balls import balls_of
 from ballfg.importing.shots import Counts, SourceShot
-from ballfg.importing.spins import with_spins
 from ballfg.importing.stamps import in_seconds, origin_of
 from ballfg.tracks import Track
 from ballfg.tracks.checks import Findings, tidy
-from ballfg.tracks.grouping import RowGroup
 from ballfg.tracks.info import DatasetInfo
+from ballfg.tracks.rows import RowGroup
 
 STUCK: Final = 4  # samples in a row that are exactly the largest or smallest of all: no moving ball does that
 AGAIN: Final = 2  # times that it happens where a limit clips; once is a ball at rest

@@ -6,8 +6,7 @@ from .config import (
     SimulationConfig as SimulationConfig,
 )
 from .scene.config import Clock as Clock, SceneConfig as SceneConfig
-from .scene.recording import record as record
-from .scene.writing import write_scene as write_scene
+from .scene.recording import record as record, write_scene as write_scene
 from .synthetic import simulate as simulate
 from .undeclared import parse_effects as parse_effects
 from .writing import write_simulation as write_simulation

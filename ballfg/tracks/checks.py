@@ -17,7 +17,7 @@ from ballfg.progress import counted
 from ballfg.state import STANDARD_GRAVITY, Z
 
 if TYPE_CHECKING:
-    from ballfg.tracks.grouping import RowGroup
+    from ballfg.tracks.rows import RowGroup
 
 MERGE_DISTANCE = 0.1  # m: two rows at one stamp farther apart are refused; one frame of a ball at 15 m/s and 150 Hz
 MAX_COORDINATE = 1000.0  # m: positions farther from the origin are refused

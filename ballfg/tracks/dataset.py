@@ -14,10 +14,21 @@ from ballfg.checks import check_each, check_instance, check_iterable, check_path
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
-from ballfg.tracks.grouping import Index, RowGroup, groups, scan
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
-from ballfg.tracks.rows import KEY, SIGMAS, VALUES, Block, CsvRows, ParquetRows, RowSource
+from ballfg.tracks.rows import (
+    KEY,
+    SIGMAS,
+    VALUES,
+    Block,
+    CsvRows,
+    Index,
+    ParquetRows,
+    RowGroup,
+    RowSource,
+    groups,
+    scan,
+)
 from ballfg.tracks.track import Label, Track
 
 TRACK_FILES = ("tracks.csv", "tracks.parquet")

@@ -12,10 +12,9 @@ from ballfg.files.spreadsheet import guarded
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks.checks import check_scale
 from ballfg.tracks.dataset import TRACK_FILES
-from ballfg.tracks.grouping import MAX_SIGMA, MIN_SIGMA
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
 from ballfg.tracks.labels import LABELS_FILE
-from ballfg.tracks.rows import KEY, SIGMAS, VALUES
+from ballfg.tracks.rows import KEY, MAX_SIGMA, MIN_SIGMA, SIGMAS, VALUES
 from ballfg.tracks.table import TableWriter
 from ballfg.tracks.track import Track
 

@@ -34,7 +34,7 @@ from ballfg.tracks.sightings import Sightings
 from ballfg.vision import Camera
 from ballfg.vision.calibration.focal import pose_and_focal
 from ballfg.vision.calibration.table_points import Marked
-from ballfg.vision.camera_change import changed
+from ballfg.vision.projection import changed
 
 METHOD: Final = "smoother, one camera"
 CALIBRATED: Final = "smoother, one camera, calibrated by the view's other strokes"

@@ -13,10 +13,8 @@ from ballfg.arrays import Array
 from ballfg.benchmarks.metrics import nees, root_mean_square
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene.config import SceneConfig
-from ballfg.simulation.scene.flights import Flight
-from ballfg.simulation.scene.recording import Recording, record
-from ballfg.simulation.scene.shutter import free_running
-from ballfg.simulation.scene.writing import write_scene
+from ballfg.simulation.scene.recording import Recording, record, write_scene
+from ballfg.simulation.scene.shutter import Flight, free_running
 from ballfg.vision.association.gathering import SeenBall, nearest
 from ballfg.vision.detection.detect import detect_all
 from ballfg.vision.detection.detections import Detections

@@ -26,7 +26,7 @@ from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.parallel.processes import Processes
 from ballfg.progress import progress
 from ballfg.simulation.scene.config import Clock
-from ballfg.simulation.scene.writing import write_scene
+from ballfg.simulation.scene.recording import write_scene
 from ballfg.vision import Camera, Detections, associate, check_agreement, detect_all, track_detections
 
 

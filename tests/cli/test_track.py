@@ -13,8 +13,7 @@ import pytest
 
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene.config import SceneConfig
-from ballfg.simulation.scene.recording import record
-from ballfg.simulation.scene.writing import write_scene
+from ballfg.simulation.scene.recording import record, write_scene
 from ballfg.tracks import read_dataset
 from ballfg.vision.camera_file import read_cameras, write_cameras
 from tests.commands import printed, refused, status

@@ -24,9 +24,9 @@ from ballfg.arrays import Array
 from ballfg.estimation.rally.video import Rally, track_moving_camera
 from ballfg.simulation.balls import ball_kind
 from ballfg.vision.broadcast.court import TABLE_TENNIS, Court, read_court
-from ballfg.vision.broadcast.given import read_candidates
 from ballfg.vision.broadcast.lines import moved, slopes
 from ballfg.vision.broadcast.motion import Shot
+from ballfg.vision.broadcast.pictures import read_candidates
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.detection.video import open_video
 from tests.places import DATA

@@ -24,7 +24,7 @@ from ballfg.arrays import Array
 from ballfg.benchmarks.cameras.films import STANDING, VIEWS, Filmed, Truth
 from ballfg.benchmarks.cameras.rallies import STANDING_RATE, CameraScore, Score, rated, rated_standing
 from ballfg.state import POSITION
-from ballfg.vision.broadcast.given import read_candidates
+from ballfg.vision.broadcast.pictures import read_candidates
 from tests.vision.broadcast.own import write_candidates
 
 NOISE = 1.0  # px, of another detector

@@ -11,8 +11,7 @@ from ballfg.factors.batch import Values
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.factors.check import check_factor
 from ballfg.factors.uncertain_camera import UncertainCameraFactors
-from ballfg.vision.camera_change import CHANGES, changed
-from ballfg.vision.projection import CameraBank
+from ballfg.vision.projection import CHANGES, CameraBank, changed
 from tests.factors.test_camera import RIG, factors, radii
 
 SIGMAS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.03])

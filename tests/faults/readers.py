@@ -28,7 +28,7 @@ from ballfg.pages.given import recognise
 from ballfg.pages.show_page import show_page
 from ballfg.pages.shown import collect
 from ballfg.simulation.balls import ball_kind
-from ballfg.simulation.scene.writing import earlier_files
+from ballfg.simulation.scene.recording import earlier_files
 from ballfg.tracks import read_dataset
 from ballfg.vision import open_video, read_cameras
 from ballfg.vision.calibration.table_points import read_table

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ballfg.importing import Format, import_tracks, register_format
-from ballfg.importing.formats.registry import FORMATS
+from ballfg.importing.formats.sources import FORMATS
 from tests.importing.throws import thrown
 
 

@@ -24,7 +24,7 @@ REGISTRIES = (
     ("observations", "ballfg.estimation.observations.registry", "OBSERVATIONS"),
     ("estimators", "ballfg.estimation.registry", "ESTIMATORS"),
     ("trainees", "ballfg.learning.trainee", "TRAINEES"),
-    ("formats", "ballfg.importing.formats.registry", "FORMATS"),
+    ("formats", "ballfg.importing.formats.sources", "FORMATS"),
 )
 """Title, module and attribute of each registry, in the order of the output."""
 WIDTH = 110  # Largest number of characters in a line

@@ -56,7 +56,7 @@ def render(
     visible.csv the true place of each ball in each frame, scene.yaml all settings.
     """
     from ballfg.simulation import SceneConfig, parse_effects, record, table_rig, write_scene
-    from ballfg.simulation.scene.writing import check_scene_folder
+    from ballfg.simulation.scene.recording import check_scene_folder
     from ballfg.simulation.settings import parse_settings
 
     know_effects(effects_file)

@@ -179,9 +179,9 @@ def _moving_camera(
     from ballfg.machine import usable_cores
     from ballfg.parallel.parts import with_jobs
     from ballfg.tracks.info import DatasetInfo
-    from ballfg.vision.broadcast.court import TABLE_TENNIS, read_court
+    from ballfg.vision.broadcast.court import TABLE_TENNIS, read_corners, read_court
     from ballfg.vision.broadcast.files import FILES, TRACKED
-    from ballfg.vision.broadcast.given import read_candidates, read_corners
+    from ballfg.vision.broadcast.pictures import read_candidates
     from ballfg.vision.detection.video import open_video
     from ballfg.vision.tracking.dataset import check_result_folder
 

@@ -34,8 +34,7 @@ from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Label, Track
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_change import CHANGES
-from ballfg.vision.projection import CameraBank
+from ballfg.vision.projection import CHANGES, CameraBank
 
 if TYPE_CHECKING:
     from ballfg.dynamics.model import BallModel

@@ -17,9 +17,8 @@ from ballfg.estimation.result import Status
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.broadcast.candidates import BALLS, find_candidates
 from ballfg.vision.broadcast.court import Court
-from ballfg.vision.broadcast.doubled import Kept, without_doubled
 from ballfg.vision.broadcast.motion import Frames, Motion, Shot, find_motion
-from ballfg.vision.broadcast.resized import Scale
+from ballfg.vision.broadcast.pictures import Kept, Scale, without_doubled
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.one_thread import one_thread
 

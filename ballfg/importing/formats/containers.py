@@ -1,17 +1,21 @@
-"""Reads containers of tables of numbers: Parquet, Excel, npz, HDF5, ROS bags."""
+"""Reads containers of tables of numbers: Parquet, Excel, npz, HDF5, MATLAB, ROS bags."""
 
 import math
+import pickle
+import subprocess
 import sys
 import zipfile
+import zlib
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from struct import unpack
 from typing import IO, Any, Final
 
 import numpy as np
 
 from ballfg.checks import listed, shown
-from ballfg.files.damaged import FREE, NUMBER, check_parts, check_unpacked, library_reads
+from ballfg.files.damaged import FREE, NUMBER, check_parts, check_unpacked, library_reads, most_unpacked
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
@@ -20,6 +24,9 @@ MAX_DEPTH: Final = 40  # largest depth of nested groups
 MAX_MEMBERS: Final = 20_000  # files of an archive, or datasets and groups of an HDF5 file: four for each of 5,000 shots
 EXCEL_FREE: Final = 1_000_000  # bytes of XML that any Excel file may hold: openpyxl reads some 2 MB a second
 EXCEL_CELLS: Final = 25_000  # of any Excel file, plus one for each two bytes of its size: a number takes three or more
+_HEADER: Final = 128  # bytes of a MATLAB file before the first variable; the last two give the byte order
+_COMPRESSED: Final = 15  # the kind of a compressed variable
+_BLOCK: Final = 1 << 20
 _PLAIN: Final = "Save plain arrays of numbers with numpy.savez."
 
 
@@ -141,6 +148,41 @@ def read_hdf5(path: Path) -> list[RawTable]:
     with library_reads(path, "HDF5"), h5py.File(path, "r") as file:
         content = _Group(h5py, path).content(file, 0)
     return nested_tables(content, path.stem, str(path))
+
+
+def read_matlab(path: Path) -> list[RawTable]:
+    """The tables of a MATLAB file of any version. Raises: ValueError: not one, or version 7.3 without h5py."""
+    child = Path(__file__).with_name("matlab_child.py")
+    with library_reads(path, "MATLAB"):
+        _check_packed(path)
+        command = [sys.executable, "-P", str(child), str(path.absolute()), str(most_unpacked(path))]
+        done = subprocess.run(command, capture_output=True, check=False)
+        if done.returncode:
+            said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+            raise ValueError(said[-1] if done.returncode > 0 and said else "its parts have sizes that cannot be")
+        outcome, content = pickle.loads(done.stdout)  # from this project's own process
+        if outcome == "error":
+            raise ValueError(content)
+    if outcome == "too large":
+        check_unpacked(path, content)
+    return read_hdf5(path) if outcome == "hdf5" else nested_tables(content, path.stem, str(path))
+
+
+def _check_packed(path: Path) -> None:
+    """Counts the unpacked bytes of a version 5 file (MathWorks, MAT-File Format, level 5). Raises: ValueError."""
+    with path.open("rb") as file:
+        order = {b"IM": "<II", b"MI": ">II"}.get(file.read(_HEADER)[-2:])
+        size = 0
+        while order and len(tag := file.read(8)) == 8:
+            kind, length = unpack(order, tag)
+            if kind != _COMPRESSED:
+                file.seek(length, 1)
+                continue
+            packed, inflate = file.read(length), zlib.decompressobj()
+            while packed and not inflate.eof:
+                size += len(inflate.decompress(packed, _BLOCK))
+                check_unpacked(path, size)
+                packed = inflate.unconsumed_tail
 
 
 def read_bag(path: Path, topic: str | None) -> list[RawTable]:

@@ -1,20 +1,50 @@
-"""Turns the files, folders or data of a user into tables."""
+"""Turns the files, folders or data of a user into tables, of formats that others register too."""
 
 import json
 import zipfile
+from abc import ABC, abstractmethod
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from ballfg.checks import check_path, listed, shown
 from ballfg.files.json_file import TOO_MANY, has_too_many, parse_json
-from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
-from ballfg.importing.formats.matlab import read_matlab
+from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_matlab, read_npz, read_parquet
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
-from ballfg.importing.formats.registry import FORMATS, Format
 from ballfg.importing.formats.text_files import decoded, text_table
+from ballfg.registry import Registry
 from ballfg.tracks.info import INFO_FILE
+
+
+class Format(ABC):
+    """A user's file format: a name, the endings of its files, and a reader.
+
+    Attributes:
+        name: of the format.
+        endings: of its files, with the dot and in small letters, such as `.trk`.
+    """
+
+    name: ClassVar[str]
+    endings: ClassVar[tuple[str, ...]]
+
+    @staticmethod
+    @abstractmethod
+    def read(path: Path) -> Any:
+        """The content of a file: a mapping of column names to arrays, an array (n, 4), or a list of such parts.
+
+        Times are in s and positions in m, unless column names state a unit.
+
+        Raises: ValueError: if the file cannot be read; the message names it.
+        """
+
+
+FORMATS: Final[Registry[Format]] = Registry(
+    "format", group="ballfg.formats", base=Format, remedy="docs/add_an_effect.md has an example."
+)
+register_format = FORMATS.register
+"""Registers a format, so that its files can be imported; may decorate the class."""
+
 
 TEXT: Final = (".csv", ".tsv", ".txt", ".dat", ".tab", ".asc", "")
 JSON: Final = (".json", ".jsonl", ".ndjson")

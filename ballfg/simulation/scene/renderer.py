@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.simulation.scene.backdrop import backdrop
 from ballfg.simulation.scene.config import SceneConfig
-from ballfg.simulation.scene.movers import draw, movers
-from ballfg.simulation.scene.room import Colour, Rect, clipped, grown
+from ballfg.simulation.scene.room import Colour, Rect, clipped, draw, grown, movers
 from ballfg.simulation.scene.shutter import Frames, Passage
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.vision.camera import Camera

@@ -113,7 +113,7 @@ def _of_cameras(cameras: Sequence[Camera], made: Triangulated, noise: Array) -> 
         rows = np.flatnonzero(made.used[:, number])
         if camera.covariance is None or not len(rows):
             continue
-        from ballfg.vision.camera_change import by_changes  # with torch, which exact cameras need not load
+        from ballfg.vision.projection import by_changes  # with torch, which exact cameras need not load
 
         by_point, by_change = by_changes(camera, made.points[rows])
         gain = made.covariances[rows] @ by_point.swapaxes(1, 2) @ np.linalg.inv(noise[rows, number])

@@ -1,4 +1,4 @@
-"""Defines a court: points and lines with known places, from a name or a file of a user."""
+"""Defines a court: points and lines with known places, from a name or a file; reads its corners in pictures."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.checks import check_keys, is_number, shown
 from ballfg.files.strict_yaml import mapping, read_mapping
+from ballfg.tracks import csv_files
 from ballfg.vision.calibration.table_points import TABLE_HEIGHT, TABLE_LENGTH, TABLE_WIDTH
 
 TABLE_TENNIS: Final = "table-tennis"
@@ -88,6 +89,34 @@ def read_court(source: str) -> Court:
     net = tuple(_numbers(f"{path}: net", content["net"], 2).tolist()) if "net" in content else None
     floor = float(_numbers(f"{path}: floor", [content["floor"]], 1)[0]) if "floor" in content else None
     return _court(np.stack(corners), [(a, b) for a, b in lines], float(width), net, floor)
+
+
+def read_corners(path: Path) -> dict[int, Array]:
+    """Corners of the court (4, 2) px in some pictures, in any order.
+
+    Args: path: a table `frame,u,v` with four rows for each of its pictures, counted from 0.
+    Raises: FileNotFoundError. ValueError: a column that is missing, a cell that is no number, a picture without four
+        corners; the message names the file and the picture.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"--corners {path} does not exist. Check the path.")
+    names = [name.strip() for name in csv_files.read_header(path)]
+    if not {"frame", "u", "v"} <= set(names):
+        raise ValueError(f"{path} must have the columns frame, u, v; got {', '.join(names)}. Name them in line 1.")
+    found = dict[int, list[tuple[float, float]]]()
+    for line, cells in csv_files.records(path):
+        row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
+        if not all(csv_files.is_number(row.get(name, "")) for name in ("frame", "u", "v")):
+            raise ValueError(f"{path}, line {line}: frame, u and v must be numbers. Correct it.")
+        if float(row["frame"]) % 1.0 != 0.0:
+            raise ValueError(
+                f"{path}, line {line}: frame must be a picture's number, from 0 on; got {row['frame']}. Correct it."
+            )
+        found.setdefault(int(float(row["frame"])), []).append((float(row["u"]), float(row["v"])))
+    for frame, points in found.items():
+        if len(points) != CORNERS:
+            raise ValueError(f"{path}: picture {frame} must have {CORNERS} corners; got {len(points)}. Correct it.")
+    return {frame: np.array(points) for frame, points in found.items()}
 
 
 def _court(

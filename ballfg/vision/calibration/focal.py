@@ -10,7 +10,7 @@ from ballfg.checks import check_range
 from ballfg.vision.calibration.extrinsics import Extrinsics, check_one, likely_poses, noise_shown, squares
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_change import CHANGES, ZOOM, by_changes, changed
+from ballfg.vision.projection import CHANGES, ZOOM, by_changes, changed
 
 ROUGHLY: Final = (1e-4, 0.3)  # Smallest and largest relative standard deviation of a focal length
 TRIED: Final = (0.0, -1.0, 1.0, -2.0, 2.0)

@@ -31,7 +31,7 @@ from ballfg.simulation.scene.recording import record
 from ballfg.tracks import read_dataset
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_change import changed
+from ballfg.vision.projection import changed
 from tests.estimation.nees import inside, nees
 from tests.estimation.observations.sighted_rig import TABLE, World, looking, world
 from tests.places import DATA

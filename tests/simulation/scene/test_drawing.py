@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ballfg.simulation.scene.backdrop import TEXTURE_DEPTH, _walls
-from ballfg.simulation.scene.movers import Capsule, _distance_to_segment, draw, movers
-from ballfg.simulation.scene.room import FLOOR_COLOUR
+from ballfg.simulation.scene.room import FLOOR_COLOUR, Capsule, _distance_to_segment, draw, movers
 from ballfg.vision import Camera
 
 

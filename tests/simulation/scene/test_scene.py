@@ -13,10 +13,9 @@ from ballfg.simulation import SimulationConfig, parse_effects, simulate, table_t
 from ballfg.simulation.cameras import looking_at, table_rig
 from ballfg.simulation.scene.backdrop import backdrop
 from ballfg.simulation.scene.config import Clock, SceneConfig
-from ballfg.simulation.scene.movers import movers
 from ballfg.simulation.scene.recording import Recording, record, visible_columns
 from ballfg.simulation.scene.renderer import Renderer
-from ballfg.simulation.scene.room import furniture
+from ballfg.simulation.scene.room import furniture, movers
 from ballfg.simulation.scene.shutter import PATH_POINTS, free_running
 
 SMALL = (320, 180)

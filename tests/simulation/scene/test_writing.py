@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from ballfg.simulation import parse_effects
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene.config import Clock, SceneConfig
-from ballfg.simulation.scene.recording import Recording, record
-from ballfg.simulation.scene.writing import TRUTH_RATE, write_scene
+from ballfg.simulation.scene.recording import TRUTH_RATE, Recording, record, write_scene
 from ballfg.vision.camera_file import read_cameras
 
 FILES = {"cameras.yaml", "scene.yaml", "truth.csv", "visible.csv"} | {

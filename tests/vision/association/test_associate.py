@@ -10,8 +10,8 @@ from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.calibration.focal import pose_and_focal
 from ballfg.vision.calibration.table_points import Marked, table_points
-from ballfg.vision.camera_change import ZOOM, changed
 from ballfg.vision.detection.detections import Candidates, Detections
+from ballfg.vision.projection import ZOOM, changed
 from tests.vision.filming import CENTRES, Shot, World, film, looking, rig, shots, turned
 from tests.vision.judging import judge
 

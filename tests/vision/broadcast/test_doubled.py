@@ -11,7 +11,7 @@ import pytest
 
 from ballfg.benchmarks.cameras.hall import looking, picture
 from ballfg.vision.arrays import Image
-from ballfg.vision.broadcast.doubled import without_doubled
+from ballfg.vision.broadcast.pictures import without_doubled
 from ballfg.vision.detection.video import open_video
 
 CAMERA = looking((0.5, -8.0, 3.5), (0.0, 0.0, 0.0), 1000.0)

@@ -10,10 +10,9 @@ import pytest
 
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.rally.video import track_moving_camera
-from ballfg.vision.broadcast.court import read_court
-from ballfg.vision.broadcast.doubled import Kept, without_doubled
-from ballfg.vision.broadcast.given import read_candidates, read_corners
+from ballfg.vision.broadcast.court import read_corners, read_court
 from ballfg.vision.broadcast.motion import Shot
+from ballfg.vision.broadcast.pictures import Kept, read_candidates, without_doubled
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.detection.video import open_video
 from tests.vision.broadcast.test_doubled import flight, written

@@ -12,7 +12,7 @@ from ballfg.benchmarks.cameras.hall import COURT, ORANGE, Look, looking, panned,
 from ballfg.vision.broadcast.candidates import aligned_candidates
 from ballfg.vision.broadcast.find import find_court, joined_segments
 from ballfg.vision.broadcast.motion import find_motion
-from ballfg.vision.broadcast.resized import WIDTHS, Scale
+from ballfg.vision.broadcast.pictures import WIDTHS, Scale
 from ballfg.vision.detection.detections import Candidates, Detections
 
 SIZES = [(640, 360), (854, 480), (1920, 1080), (3840, 2160)]

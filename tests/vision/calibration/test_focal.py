@@ -12,7 +12,7 @@ from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
 from ballfg.vision.calibration.focal import pose_and_focal
 from ballfg.vision.calibration.report import UNLIKELY, Calibration, summary
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_change import ZOOM, changed
+from ballfg.vision.projection import ZOOM, changed
 from tests.vision.calibration.test_extrinsics import AT, CORNERS, PLACES, marked, shaken, standing, turned
 
 
