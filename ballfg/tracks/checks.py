@@ -23,6 +23,7 @@ MERGE_DISTANCE = 0.1  # m: two rows at one stamp farther apart are refused; one 
 MAX_COORDINATE = 1000.0  # m: positions farther from the origin are refused
 MAX_EXTENT = 250.0  # m: a longer track is refused; no struck ball flies farther
 MAX_SPEED = 343.0  # m/s: a track whose median speed is above that of sound is refused
+MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6  # m, of a sample; a large one marks a sample with little weight
 MAX_MEDIAN_SIGMA = 1.0  # m: a track with a larger median sigma is refused
 MAX_STEP = 1.0  # s: a track whose median time step is longer is refused; no bounce could be seen in it
 MIN_STEP = 1e-6  # s: a track whose median time step is shorter is refused; no camera is that fast

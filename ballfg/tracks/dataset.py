@@ -1,8 +1,7 @@
 """A dataset is a folder of tracks that is checked once and then streamed as often as needed."""
 
 import copy
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -12,23 +11,11 @@ import numpy as np
 
 from ballfg.checks import check_each, check_instance, check_iterable, check_path, listed, shown
 from ballfg.files.whole_folder import of_one_state
-from ballfg.tracks.checks import Findings, check_scale, tidy
+from ballfg.tracks.checks import MAX_SIGMA, MIN_SIGMA, Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, TrackFolder, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
-from ballfg.tracks.rows import (
-    KEY,
-    SIGMAS,
-    VALUES,
-    Block,
-    CsvRows,
-    Index,
-    ParquetRows,
-    RowGroup,
-    RowSource,
-    groups,
-    scan,
-)
+from ballfg.tracks.rows import KEY, SIGMAS, VALUES, Block, CsvRows, Index, ParquetRows, RowSource, groups, scan
 from ballfg.tracks.track import Label, Track
 
 TRACK_FILES = ("tracks.csv", "tracks.parquet")
@@ -146,7 +133,12 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
             notes.append(f"{LABELS_FILE}: {missing} of {len(index.names)} trajectories unlabelled")
     findings = Findings()
     for group in groups(source, index):
-        check_group(source, group, info, findings)
+        values = tidy(group, source.where, findings)
+        sigmas = values[:, 4:] if values.shape[1] > 4 else None
+        try:
+            check_scale(f"trajectory {shown(group.name)}", values[:, 0], values[:, 1:4], sigmas, info.rate)
+        except ValueError as error:
+            raise ValueError(f"{source.where(int(group.rows[0]))}: {error}") from None
     if not index.contiguous:
         notes.append(f"{source.path.name}: the rows of different trajectories interleave: regrouped at each pass")
     return Dataset(path, info, source, index, labels, notes + findings.notes())
@@ -181,14 +173,32 @@ def _listing(folder: Path) -> str:
     return listed(sorted(entry.name for entry in folder.iterdir())) if any(folder.iterdir()) else "an empty folder"
 
 
-def check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings: Findings) -> None:
-    """Refuses a trajectory whose numbers cannot be metres and seconds; repairs are added to the findings."""
-    values = tidy(group, source.where, findings)
-    sigmas = values[:, 4:] if values.shape[1] > 4 else None
-    try:
-        check_scale(f"trajectory {shown(group.name)}", values[:, 0], values[:, 1:4], sigmas, info.rate)
-    except ValueError as error:
-        raise ValueError(f"{source.where(int(group.rows[0]))}: {error}") from None
+def checked(tracks: Iterable[Track], info: DatasetInfo) -> Iterator[Track]:
+    """The tracks, each checked on its turn as one of a dataset that can be read.
+
+    Raises: ValueError: no tracks, a repeated name, sigmas of some, or numbers that cannot be metres and seconds.
+    """
+    names: set[str] = set()
+    has_sigmas: bool | None = None
+    for track in check_each("tracks", tracks, Track, "Make one with Track(times, positions)."):
+        has_sigmas = track.sigmas is not None if has_sigmas is None else has_sigmas
+        if track.name in names:
+            raise ValueError(f"track names must be unique; got {shown(track.name)} twice. Rename one of them.")
+        if len(track) < 2:
+            raise ValueError(f"track {shown(track.name)} must have at least two samples; got one. Leave it out.")
+        if (track.sigmas is not None) != has_sigmas:
+            what = f"tracks must have sigmas all or none; {shown(track.name)} differs from the first"
+            raise ValueError(f"{what}. Set sigmas=None in all of them, or give them all.")
+        if track.sigmas is not None and not (MIN_SIGMA <= track.sigmas.min() <= track.sigmas.max() <= MAX_SIGMA):
+            raise ValueError(
+                f"track {shown(track.name)}: sigmas must be {MIN_SIGMA:g} to {MAX_SIGMA:g} m; "
+                f"got {track.sigmas.min():g} to {track.sigmas.max():g}. Correct them or set sigmas=None."
+            )
+        check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, info.rate)
+        names.add(track.name)
+        yield track
+    if not names:
+        raise ValueError("tracks must hold at least one track; got none. Pass the tracks.")
 
 
 class MemoryRows(RowSource):
@@ -227,21 +237,11 @@ def dataset_in_memory(info: DatasetInfo, tracks: Sequence[Track], notes: Sequenc
     Raises: ValueError: no tracks, a repeated name, or a track whose numbers cannot be metres and seconds.
     """
     check_instance("info", info, DatasetInfo, "Make one with DatasetInfo(name, table_height, ball).")
-    tracks = tuple(check_each("tracks", tracks, Track, "Make one with Track(times, positions)."))
+    tracks = tuple(checked(tracks, info))
     check_iterable("notes", notes)
-    if not tracks:
-        raise ValueError("tracks must hold at least one track; got none. Pass the tracks.")
-    if len({track.sigmas is None for track in tracks}) > 1:
-        raise ValueError("tracks must have sigmas all or none; some have them. Set sigmas=None in all, or give them.")
-    name, count = Counter(track.name for track in tracks).most_common(1)[0]
-    if count > 1:
-        raise ValueError(f"track names must be unique; got {shown(name)} twice. Rename one of them.")
-    source = MemoryRows(tracks)
-    index = scan(source)
-    findings = Findings()
-    for group in groups(source, index):
-        check_group(source, group, info, findings)
+    source, counts = MemoryRows(tracks), np.array([len(track) for track in tracks])
+    index = Index([track.name for track in tracks], counts, True, source.stamp())
     labels = dict.fromkeys(label for track in tracks for label in track.labels)
     columns: dict[str, list[Label | None]] = {label: [track.labels.get(label) for track in tracks] for label in labels}
     table = LabelTable(columns, {track.name: i for i, track in enumerate(tracks)} if labels else {})
-    return Dataset(Path(f"{info.name} (in memory)"), info, source, index, table, [*notes, *findings.notes()])
+    return Dataset(Path(f"{info.name} (in memory)"), info, source, index, table, list(notes))

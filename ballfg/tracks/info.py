@@ -70,10 +70,8 @@ TENNIS = Ball(radius=0.0335, mass=0.0577)  # ITF Rules of Tennis, Appendix I, ty
 class Lamp:
     """A lamp whose shadow of the ball on the table was seen. Raises: ValueError, TypeError: a place that is none."""
 
-    place: tuple[float, float, float]
-    """(x, y, z) m, in the frame of the dataset."""
-    sigma: float = 0.0
-    """m, standard deviation of each coordinate; 0: exact."""
+    place: tuple[float, float, float]  # (x, y, z) m, in the frame of the dataset
+    sigma: float = 0.0  # m, standard deviation of each coordinate; 0: exact
 
     def __post_init__(self) -> None:
         if not isinstance(self.place, tuple | list) or len(self.place) != 3:
@@ -90,32 +88,23 @@ class DatasetInfo:
     Raises: ValueError, TypeError: a field of a wrong type or range; the message names it.
     """
 
-    name: str
-    """One line of text."""
+    name: str  # one line of text
     table_height: float | None
     """z of the table's surface, m; None where balls meet no surface (`table_height: none` in the file)."""
-    ball: Ball
-    """Radius (m) and mass (kg)."""
-    rate: float | None = None
-    """Nominal sampling rate, Hz. Computations use the stamps of the tracks."""
-    position_noise: float | None = None
-    """Standard deviation of one measured coordinate, m."""
-    spin_noise: float | None = None
-    """Standard deviation of one component of the spin labels, rad/s."""
-    source: str | None = None
-    """Origin of the data."""
-    licence: str | None = None
-    """Terms of use."""
+    ball: Ball  # radius (m) and mass (kg)
+    rate: float | None = None  # nominal sampling rate, Hz. Computations use the stamps of the tracks
+    position_noise: float | None = None  # standard deviation of one measured coordinate, m
+    spin_noise: float | None = None  # standard deviation of one component of the spin labels, rad/s
+    source: str | None = None  # origin of the data
+    licence: str | None = None  # terms of use
     table_extent: tuple[float, float, float, float] | None = None
     """(x_low, x_high, y_low, y_high) m, the table's ends; None if unknown."""
     noise: TrackNoise | None = None
     """All known noise of the tracks, as from `ballfg noise`; it takes precedence over the two numbers above."""
     imported: Mapping[str, Any] | None = None
     """Origin and conversion of the tracks, as `ballfg import` records them in the section `import`; for people."""
-    doubts: tuple[str, ...] = ()
-    """What is not sure about the tracks, one line of text each; commands repeat it."""
-    lamp: Lamp | None = None
-    """Lamp of the shadows that the dataset holds."""
+    doubts: tuple[str, ...] = ()  # what is not sure about the tracks, one line of text each; commands repeat it
+    lamp: Lamp | None = None  # lamp of the shadows that the dataset holds
 
     def __post_init__(self) -> None:
         check_name("name", self.name)
@@ -167,6 +156,7 @@ class DatasetInfo:
             problem = f"frame.up must be 'z', the only up axis that is supported; got {shown(frame['up'])}"
             raise ValueError(f"{problem}. Rotate the positions so that z points up.")
         _need(content, "name", "")
+        lamp = None if content.get("lamp") is None else _section(content, "lamp", {"place": "[x, y, z]"})
         return cls(
             name=content["name"],
             table_height=None if frame["table_height"] == NO_SURFACE else frame["table_height"],
@@ -175,7 +165,7 @@ class DatasetInfo:
             noise=None if content.get("noise") is None else TrackNoise.from_mapping(content["noise"]),
             imported=content.get("import"),
             doubts=() if content.get("doubts") is None else content["doubts"],
-            lamp=None if content.get("lamp") is None else _stated_lamp(content),
+            lamp=None if lamp is None else Lamp(lamp["place"], lamp.get("sigma", 0.0)),
             **{key: content.get(key) for key in _OPTIONAL},
         )
 
@@ -267,11 +257,6 @@ def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], pr
     if commas := [name for name, value in section.items() if value is None and str(name).isdigit()]:
         raise ValueError(f"{prefix}{key} must have a decimal point in each number; got a comma before {commas[0]}.")
     return section
-
-
-def _stated_lamp(content: Mapping[str, Any]) -> Lamp:
-    lamp = _section(content, "lamp", {"place": "[x, y, z]"})
-    return Lamp(lamp["place"], lamp.get("sigma", 0.0))
 
 
 def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:

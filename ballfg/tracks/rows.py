@@ -24,6 +24,7 @@ from ballfg.files.damaged import MAX_LINE
 from ballfg.files.parquet import open_parquet
 from ballfg.files.spreadsheet import bare
 from ballfg.tracks import csv_files
+from ballfg.tracks.checks import MAX_SIGMA, MIN_SIGMA
 from ballfg.tracks.csv_files import no_rows
 
 KEY = "trajectory"
@@ -155,9 +156,6 @@ def distinct(column: pa.Array) -> tuple[list[str | None], NDArray[np.int32]]:
 def _counted(word: str, numbers: Sequence[int]) -> str:
     plural = word if len(numbers) == 1 else word + "s"
     return f"{plural} {' and '.join(map(str, numbers))}"
-
-
-MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6  # m, of a sample; a large one marks a sample with little weight
 
 
 @dataclass(frozen=True)

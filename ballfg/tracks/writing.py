@@ -7,14 +7,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Final, Literal, TextIO
 
-from ballfg.checks import check_choice, check_each, check_instance, check_path, shown
+from ballfg.checks import check_choice, check_instance, check_path
 from ballfg.files.spreadsheet import guarded
 from ballfg.files.whole_folder import whole_folder
-from ballfg.tracks.checks import check_scale
-from ballfg.tracks.dataset import TRACK_FILES
+from ballfg.tracks.dataset import TRACK_FILES, checked
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
 from ballfg.tracks.labels import LABELS_FILE
-from ballfg.tracks.rows import KEY, MAX_SIGMA, MIN_SIGMA, SIGMAS, VALUES
+from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.tracks.table import TableWriter
 from ballfg.tracks.track import Track
 
@@ -65,14 +64,9 @@ def write_dataset(
 
 def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool: TextIO) -> list[str]:
     """Writes the table, and each track's labels as one line of JSON; returns the names of all labels."""
-    names: set[str] = set()
     label_names: dict[str, None] = {}
-    has_sigmas: bool | None = None
     with TableWriter(path) as table:
-        for track in check_each("tracks", tracks, Track, "Make one with Track(times, positions)."):
-            has_sigmas = track.sigmas is not None if has_sigmas is None else has_sigmas
-            _check_track(track, names, info, has_sigmas)
-            names.add(track.name)
+        for track in checked(tracks, info):
             columns = dict(zip(VALUES[1:], track.positions.T, strict=True))
             if track.sigmas is not None:
                 columns |= dict(zip(SIGMAS, track.sigmas.T, strict=True))
@@ -80,22 +74,4 @@ def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool:
             if track.labels:
                 label_names.update(dict.fromkeys(track.labels))
                 spool.write(json.dumps({KEY: track.name, **track.labels}) + "\n")
-        if not names:
-            raise ValueError("tracks must hold at least one track; got none. Pass the tracks to write.")
     return list(label_names)
-
-
-def _check_track(track: Track, names: set[str], info: DatasetInfo, has_sigmas: bool) -> None:
-    if track.name in names:
-        raise ValueError(f"track names must be unique; got {shown(track.name)} twice. Rename one of them.")
-    if len(track) < 2:
-        raise ValueError(f"track {shown(track.name)} must have at least two samples; got one. Leave it out.")
-    if (track.sigmas is not None) != has_sigmas:
-        what = f"tracks must have sigmas all or none; {shown(track.name)} differs from the first"
-        raise ValueError(f"{what}. Set sigmas=None in all of them, or give them all.")
-    if track.sigmas is not None and not (MIN_SIGMA <= track.sigmas.min() <= track.sigmas.max() <= MAX_SIGMA):
-        raise ValueError(
-            f"track {shown(track.name)}: sigmas must be {MIN_SIGMA:g} to {MAX_SIGMA:g} m; "
-            f"got {track.sigmas.min():g} to {track.sigmas.max():g}. Correct them or set sigmas=None."
-        )
-    check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, info.rate)
