@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from ballfg.checks import check_number, listed, shown
+from ballfg.checks import check_keys, check_number, listed, shown
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
 from ballfg.dynamics.model_file import model_from_dict, model_to_dict
@@ -88,9 +88,7 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     """
     if not isinstance(content, Mapping):
         raise ValueError(f"a ball must be a mapping with radius and mass; got {shown(content)}. Rewrite it.")
-    for key in content:
-        if key not in _FILE_KEYS:
-            raise ValueError(f"keys must be among {', '.join(_FILE_KEYS)}; got {shown(key)}. Rename or delete it.")
+    check_keys("a ball", dict(content), _FILE_KEYS, ())
     for key in ("radius", "mass"):
         if key not in content:
             raise ValueError(f"key '{key}' is required; got {listed(content)}. Add it.")

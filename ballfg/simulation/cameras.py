@@ -5,7 +5,7 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ballfg.checks import shown
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH
@@ -70,7 +70,15 @@ def looking_at(
         off_centre: px, from the middle of the image to the principal point.
     Raises: ValueError: centre and target on a vertical line, or arguments that `Camera` refuses.
     """
-    rotation = _level_rotation(name, np.asarray(target, dtype=np.float64) - np.asarray(centre, dtype=np.float64))
+    forward = np.asarray(target, dtype=np.float64) - np.asarray(centre, dtype=np.float64)
+    right = np.cross(forward, _UP)
+    if not np.linalg.norm(right) > 0.0:
+        raise ValueError(
+            f"camera {shown(name)}: centre must not stand over or under target; they differ by {forward.tolist()} m. "
+            "Move one of them sideways a little."
+        )
+    rows = np.stack((right, np.cross(forward, right), forward))
+    rotation = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     middle = [(side - 1) / 2 + shift for side, shift in zip(size, off_centre, strict=True)]
     return Camera(
         name=name,
@@ -80,15 +88,3 @@ def looking_at(
         rvec=np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64).reshape(3),
         tvec=-rotation @ np.asarray(centre, dtype=np.float64),
     )
-
-
-def _level_rotation(name: str, forward: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) from the world to a camera that looks along `forward` (3,) with its x axis horizontal."""
-    right = np.cross(forward, _UP)
-    if not np.linalg.norm(right) > 0.0:
-        raise ValueError(
-            f"camera {shown(name)}: centre must not stand over or under target; they differ by {forward.tolist()} m. "
-            "Move one of them sideways a little."
-        )
-    rows = np.stack((right, np.cross(forward, right), forward))
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))

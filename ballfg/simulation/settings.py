@@ -13,8 +13,7 @@ from ballfg.simulation.streams import Purpose, generator
 SETTING_LEVELS: Final[Mapping[str, range]] = {"topspin": range(-3, 6), "sidespin": range(-5, 6), "speed": range(8, 15)}
 """Levels of the paper's launcher: 9 x 11 x 7 = 693 combinations. The keys are the names of the labels."""
 
-Settings = NDArray[np.int64]
-"""(n, 3) topspin, sidespin and velocity level."""
+Settings = NDArray[np.int64]  # (n, 3) topspin, sidespin and velocity level
 
 
 def all_settings(chosen: Mapping[str, Sequence[int]] | None = None) -> Settings:

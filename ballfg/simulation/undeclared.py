@@ -3,7 +3,6 @@
 Those three test whether a diagnosis reports an unexplained part if the catalogue lacks the explanation.
 """
 
-import difflib
 import math
 from collections import ChainMap
 from collections.abc import Iterable, Mapping
@@ -12,6 +11,7 @@ from typing import Final, cast
 import torch
 from torch import Tensor
 
+from ballfg.checks import did_you_mean
 from ballfg.dynamics.effect import Coefficient, Effect, Flight, FlightEffect, vector
 from ballfg.dynamics.effects.registry import EFFECTS
 
@@ -104,13 +104,15 @@ def _parse(text: str) -> tuple[str, str, float]:
     key, equals, number = text.partition("=")
     name, dot, coefficient = key.strip().partition(".")
     if name not in UNDECLARED:
-        raise ValueError(f"effect must be one that exists; got '{name}'. {_nearest(name, UNDECLARED)}")
+        hint = did_you_mean(name, UNDECLARED) or f" Known ones: {', '.join(UNDECLARED)}."
+        raise ValueError(f"effect must be one that exists; got '{name}'.{hint}")
     known = [c.name for c in UNDECLARED[name].coefficients]
     example = f"{name}.{known[0]}=0.1"
     if not (dot and equals):
         raise ValueError(f"effect must read NAME.COEFFICIENT=VALUE; got '{text}'. Write for instance {example}.")
     if coefficient not in known:
-        raise ValueError(f"effect '{name}' has no coefficient '{coefficient}'. {_nearest(coefficient, known)}")
+        hint = did_you_mean(coefficient, known) or f" Known ones: {', '.join(known)}."
+        raise ValueError(f"effect '{name}' has no coefficient '{coefficient}'.{hint}")
     try:
         value = float(number)
     except ValueError:
@@ -118,8 +120,3 @@ def _parse(text: str) -> tuple[str, str, float]:
     if not math.isfinite(value):
         raise ValueError(f"effect {name}.{coefficient} must be a number; got '{number}'. Write for instance {example}.")
     return name, coefficient, value
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(known), n=1)
-    return f"Did you mean '{close[0]}'?" if close else f"Known ones: {', '.join(known)}."

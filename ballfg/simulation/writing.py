@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal
 
 import torch
 import yaml
@@ -24,6 +24,7 @@ from ballfg.tracks.writing import DATASET_FILES, TRUTH_FILE, TRUTH_FILES
 
 FileFormat = Literal["csv", "parquet"]
 MODEL_FILE: Final = "model.yaml"
+SIMULATION_FILES: Final = (*DATASET_FILES, *TRUTH_FILES)  # names, or patterns of names, of a simulated dataset's files
 
 
 def write_simulation(
@@ -50,8 +51,9 @@ def write_simulation(
         FileNotFoundError: the folder's parent does not exist.
     """
     path = Path(folder)
-    check_format(file_format)
-    with whole_folder(path, earlier=simulation_files()) as stage:
+    if file_format not in ("csv", "parquet"):
+        raise ValueError(f"format must be 'csv' or 'parquet'; got {shown(file_format)}. Choose one of them.")
+    with whole_folder(path, earlier=SIMULATION_FILES) as stage:
         check_replaceable(path, mark=TRUTH_FILE, what="a simulated dataset", force=force)
         with TableWriter(stage / f"truth.{file_format}") as truth:
             tracks = _with_truth(watch(simulate(config), config.tracks, "tracks simulated"), truth, config)
@@ -59,18 +61,6 @@ def write_simulation(
         save_model(config.ball.model, stage / MODEL_FILE)
         text = yaml.safe_dump(truth_content(config), sort_keys=False)
         (stage / TRUTH_FILE).write_text(text, encoding="utf-8")
-
-
-def simulation_files() -> tuple[str, ...]:
-    """Names, or patterns of names, of a simulated dataset's files."""
-    return (*DATASET_FILES, *TRUTH_FILES)
-
-
-def check_format(name: str) -> FileFormat:
-    """Checks the name of a file format and returns it. Raises: ValueError: if there is no such format."""
-    if name not in ("csv", "parquet"):
-        raise ValueError(f"format must be 'csv' or 'parquet'; got {shown(name)}. Choose one of them.")
-    return cast(FileFormat, name)
 
 
 def truth_content(config: SimulationConfig) -> dict[str, Any]:

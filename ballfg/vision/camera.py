@@ -165,14 +165,18 @@ class Camera:
         plane = cv2.undistortPoints(flat, self.matrix, self.distortion, criteria=_PRECISELY)
         return np.asarray(plane, dtype=np.float64).reshape(pixels.shape)
 
+    def directions(self, pixels: ArrayLike) -> Array:
+        """(..., 3) dimensionless, of what is seen at pixels (..., 2), in the camera's frame, with z = 1."""
+        plane = self.normalized(pixels)
+        return np.concatenate((plane, np.ones((*plane.shape[:-1], 1))), axis=-1)
+
     def rays(self, pixels: ArrayLike) -> Array:
         """Rays from the camera's centre through pixels.
 
         Args: pixels: (..., 2) px.
         Returns: (..., 3) unit vectors, dimensionless, in the world.
         """
-        plane = self.normalized(pixels)
-        directions = np.concatenate((plane, np.ones((*plane.shape[:-1], 1))), axis=-1) @ self.rotation
+        directions = self.directions(pixels) @ self.rotation
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def in_view(self, points: ArrayLike) -> Mask:
@@ -181,8 +185,12 @@ class Camera:
         Args: points: (..., 3) m, world.
         Returns: (...) bool.
         """
-        pixels = np.nan_to_num(self.project(points), nan=-1e9)
-        return np.asarray(((pixels >= -0.5) & (pixels < np.array(self.size) - 0.5)).all(axis=-1))
+        return self.holds(self.project(points))
+
+    def holds(self, pixels: Array, reach: Array | float = 0.0) -> Mask:
+        """(...) True for discs of radius `reach` (...) px about pixels (..., 2) within the image; False for NaN."""
+        reach = np.asarray(reach)[..., None]
+        return np.asarray(((pixels - reach >= -0.5) & (pixels + reach < np.array(self.size) - 0.5)).all(axis=-1))
 
 
 def _checked_covariance(where: str, given: Array) -> Array:

@@ -76,7 +76,11 @@ def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed
         raise ValueError(f"path must end in .yaml; got {path}. Rename it; write_opencv writes .xml and .json.")
     cameras = _check_names(cameras)
     fields = FIELDS if posed else (*LENS, *CLOCK)
-    plain = {camera.name: _stated(camera, fields) for camera in cameras}
+    plain = dict[str, dict[str, Any]]()
+    for one in cameras:  # no covariance of an exact camera, no readout or exposure where it is not known
+        absent = {"covariance": one.covariance is None, "readout": not one.readout, "exposure": not one.exposure}
+        stated = [field for field in fields if not absent.get(field, False)]
+        plain[one.name] = {field: np.asarray(getattr(one, field)).tolist() for field in stated}
     text = yaml.safe_dump({"cameras": plain}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     write_text(path, text)
 
@@ -133,12 +137,6 @@ def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
         hint = did_you_mean(_MATRIX, root).replace("Did you mean", "Rename")
         raise ValueError(f"{path}: node {_MATRIX!r} is required; got {listed(root)}.{hint} Add it.")
     return {key: _fields(node, f"{path}: camera {shown(key)}") for key, node in cameras.items()}
-
-
-def _stated(camera: Camera, fields: Sequence[str]) -> dict[str, Any]:
-    """The fields that a file states: no covariance of an exact camera, no readout or exposure where it is not known."""
-    absent = {"covariance": camera.covariance is None, "readout": not camera.readout, "exposure": not camera.exposure}
-    return {field: np.asarray(getattr(camera, field)).tolist() for field in fields if not absent.get(field, False)}
 
 
 def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:

@@ -35,6 +35,7 @@ from ballfg.state import POSITION, VZ
 from ballfg.vision.arrays import Image
 from ballfg.vision.broadcast.lines import moved
 from ballfg.vision.broadcast.pinhole import Pinhole
+from ballfg.vision.detection.video import write_video
 
 EXPOSURE: Final = 0.45
 """Of the time between pictures."""
@@ -214,10 +215,7 @@ def _between(of: Truth, number: float) -> Pinhole:
 
 def film(of: Truth, path: Path, rate: float, seed: int) -> None:
     """Writes the pictures as a compressed video."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, of.cameras[0].size)
-    for image in pictures(of, rate, seed):
-        writer.write(image)
-    writer.release()
+    write_video(path, pictures(of, rate, seed), rate, of.cameras[0].size, "Check the disk.")
 
 
 @dataclass(frozen=True)

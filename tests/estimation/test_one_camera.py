@@ -93,7 +93,7 @@ def test_a_rally_is_cut_at_its_hits(ball: World) -> None:
     assert unsure.doubts == [f"track 000: {Status.NOT_CONVERGED.value}"]
     ball_one = strokes.tracking.balls[0]
     np.testing.assert_array_equal(ball_one.points, strokes.estimates[0].states[:, :3])
-    assert strokes.tracking.seen(ball_one, 0).frames[0] == pytest.approx(HITS[0] * RATE, abs=5)
+    assert strokes.tracking.seen(ball_one, 0)[0][0] == pytest.approx(HITS[0] * RATE, abs=5)
 
 
 def test_what_does_not_fall_is_no_ball(ball: World) -> None:

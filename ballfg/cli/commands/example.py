@@ -38,13 +38,13 @@ def example(
     """
     from ballfg import simulation
     from ballfg.files.whole_folder import check_replaceable, whole_folder
-    from ballfg.simulation.writing import simulation_files
+    from ballfg.simulation.writing import SIMULATION_FILES
     from ballfg.tracks.writing import TRUTH_FILE
 
     plain = simulation.SimulationConfig(tracks=tracks, seed=seed)
     windy = replace(plain, seed=seed + 1, undeclared=simulation.parse_effects([WIND]))
     named = ((PLAIN, plain), (WINDY, windy))
-    earlier = [f"{name}/{file}" for name, _ in named for file in simulation_files()]
+    earlier = [f"{name}/{file}" for name, _ in named for file in SIMULATION_FILES]
     with whole_folder(out, earlier=earlier) as stage:
         if out.exists():
             for name, _ in named:

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -57,9 +57,8 @@ def simulate(
     """
     from ballfg import simulation
     from ballfg.simulation.settings import parse_settings
-    from ballfg.simulation.writing import check_format
+    from ballfg.simulation.writing import FileFormat
 
-    file_format = check_format(format)
     know_effects(effects_file)
     config = simulation.SimulationConfig(
         tracks=tracks,
@@ -74,11 +73,11 @@ def simulate(
         undeclared=simulation.parse_effects(effect or ()),
         spin_labels=spin_labels,
     )
-    simulation.write_simulation(out, config, file_format, force=force, watch=progress)
+    simulation.write_simulation(out, config, cast(FileFormat, format), force=force, watch=progress)
     names = ", ".join(e.name for e in config.undeclared) or "none"
-    files = f"tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)"
+    files = f"tracks.{format}, labels.csv, dataset.yaml, model.yaml (declared)"
     typer.echo(f"wrote {counted(tracks, 'track')} to {out}: {files}")
-    typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")
+    typer.echo(f"wrote the truth to {out}: truth.{format}, truth.yaml (undeclared effects: {names})")
 
 
 def _ball(name: str, model: Path | None) -> "BallKind":

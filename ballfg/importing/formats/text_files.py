@@ -73,7 +73,8 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
     rows = _without_thousands(rows, _COMMAS_IN_THOUSANDS, ",", ".")
     comma = separator != "," or any(_DECIMAL_COMMA.match(cell) for row in rows[-5:] for cell in row)
     if comma and any(_DECIMAL_COMMA.match(cell) for row in rows for cell in row):
-        rows = [[_with_point(cell) for cell in row] for row in _without_thousands(rows, _POINTS_IN_THOUSANDS, ".", ",")]
+        plain = _without_thousands(rows, _POINTS_IN_THOUSANDS, ".", ",")
+        rows = [[cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell for cell in row] for row in plain]
     start = _first_data_row(rows)
     if start is None:
         shown = rows_of_text[0][:60] if rows_of_text else comments[0][:60]
@@ -92,10 +93,6 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
     if len(rows) - start > len(data):
         table.notes.append(f"{len(rows) - start - len(data)} lines without {width} cells left out")
     return table
-
-
-def _with_point(cell: str) -> str:
-    return cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell
 
 
 def _without_thousands(rows: list[list[str]], pattern: re.Pattern[str], mark: str, decimal: str) -> list[list[str]]:

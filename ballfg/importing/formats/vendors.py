@@ -1,8 +1,9 @@
 """Reads the text exports of motion capture: Qualisys (TSV), Vicon Nexus (CSV), OptiTrack Motive (CSV)."""
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Final
 
 import numpy as np
@@ -116,12 +117,5 @@ def _vicon(lines: Sequence[str]) -> Capture | None:
     marked = [(name.rpartition(":")[2], k) for k, name in enumerate(names) if name]
     places = {name: (k, k + 1, k + 2) for name, k in marked if list(axes[k : k + 3]) == list(AXES)}
     unit = next((cell for cell in units if unit_of_text(cell)), "mm")
-    return Capture(float(rows[1][0]), unit, places, None, list(_section(rows[5:])))
-
-
-def _section(rows: Sequence[Sequence[str]]) -> Iterator[Sequence[str]]:
-    """The rows up to the end of a section."""
-    for row in rows:
-        if not row or not is_number(row[0]):
-            return
-        yield row
+    section = takewhile(lambda row: bool(row) and is_number(row[0]), rows[5:])
+    return Capture(float(rows[1][0]), unit, places, None, list(section))

@@ -6,15 +6,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index, Mask
 from ballfg.checks import shown
 from ballfg.simulation.balls import BallKind
 from ballfg.simulation.scene import room
+from ballfg.vision.arrays import Array32, Image
 from ballfg.vision.camera import Camera
-
-Image = NDArray[np.float32]
 
 SAMPLES: Final = 6  # Number of rays along each axis of a pixel on an edge: an edge is drawn to a twelfth of a pixel
 EDGE_REACH: Final = 5  # px, side of the finely drawn square around an edge
@@ -31,8 +29,8 @@ _SIDE_LIGHT: Final = (0.72, 0.85, 1.0)  # Light on faces across x, y and z, rela
 class Backdrop:
     """The still picture of a camera, before the lens blurs it."""
 
-    image: Image  # (h, w, 3) blue, green, red, grey levels
-    distance: Image  # (h, w) m, from the camera to the visible surface
+    image: Array32  # (h, w, 3) blue, green, red, grey levels
+    distance: Array32  # (h, w) m, from the camera to the visible surface
 
 
 def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdrop:
@@ -46,12 +44,13 @@ def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdr
             f"camera {shown(camera.name)} must stand in the room, {room.WALLS[0].tolist()} to {room.WALLS[1].tolist()} "
             f"m; it stands at {np.round(camera.centre, 2).tolist()} m. Lower the distance."
         )
-    look = partial(_look, camera, kind, room.furniture(kind), _texture(rng))
+    boxes = room.furniture(kind)
+    look = partial(_look, camera, boxes, _texture(rng))
     width, height = camera.size
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
     colours, distance, faces = look(pixels.reshape(-1, 2))
     image = colours.reshape(height, width, 3)
-    edges = _edges(faces.reshape(height, width), camera.project(room.middle_line(kind)))
+    edges = _edges(faces.reshape(height, width), camera.project(room.middle_line(boxes[0])))
     places = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     within = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
     fine, _, _ = look((pixels[edges][:, None] + within).reshape(-1, 2))
@@ -59,7 +58,7 @@ def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdr
     return Backdrop(image, distance.reshape(height, width))
 
 
-def _edges(faces: NDArray[np.uint8], thin: Array) -> NDArray[np.bool_]:
+def _edges(faces: Image, thin: Array) -> Mask:
     """(h, w) pixels around borders of faces, and those near pixels (n, 2) of a thin line."""
     around = np.ones((EDGE_REACH, EDGE_REACH), dtype=np.uint8)
     column, row = np.round(thin[np.isfinite(thin).all(axis=1)]).astype(int).T
@@ -69,9 +68,7 @@ def _edges(faces: NDArray[np.uint8], thin: Array) -> NDArray[np.bool_]:
     return np.asarray((cv2.dilate(faces, around) != cv2.erode(faces, around)) | (cv2.dilate(line, around) > 0))
 
 
-def _look(
-    camera: Camera, kind: BallKind, boxes: list[room.Box], texture: Image, pixels: Array
-) -> tuple[Image, Image, NDArray[np.uint8]]:
+def _look(camera: Camera, boxes: list[room.Box], texture: Array32, pixels: Array) -> tuple[Array32, Array32, Image]:
     """Colours (n, 3), distance (n,) m and faces (n,), white lines among them, of what is visible at pixels (n, 2)."""
     rays = (camera.normalized(pixels) @ camera.rotation[:2] + camera.rotation[2]).astype(np.float32)
     start = camera.centre.astype(np.float32)
@@ -86,14 +83,14 @@ def _look(
         if hits.any():
             hit = window[hits]
             points = start + rays[hit] * near[hits][:, None]
-            lines = box.lined & (across[hits] == 2) & room.is_line(kind, points[:, 0], points[:, 1])
+            lines = box.lined & (across[hits] == 2) & room.is_line(box, points[:, 0], points[:, 1])
             colours[hit] = _box_colour(box, points, across[hits], lines, texture)
             faces[hit] = FACES * number + across[hits] + 3 * lines
             length[hit] = near[hits]
     return colours, length * np.linalg.norm(rays, axis=-1), faces
 
 
-def _may_show(camera: Camera, box: room.Box, pixels: Array) -> NDArray[np.bool_]:
+def _may_show(camera: Camera, box: room.Box, pixels: Array) -> Mask:
     """(n,) True for pixels (n, 2) that may show a box; all if the lens cannot show all of its corners."""
     margin = 24 + camera.size[0] // 40  # straight edges bend between their corners
     corners = camera.project(box.corners())
@@ -104,7 +101,7 @@ def _may_show(camera: Camera, box: room.Box, pixels: Array) -> NDArray[np.bool_]
     return np.asarray((u >= left) & (u <= right) & (v >= top) & (v <= bottom))
 
 
-def _slabs(start: Image, rays: Image, low: Array, high: Array) -> tuple[Image, Image]:
+def _slabs(start: Array32, rays: Array32, low: Array, high: Array) -> tuple[Array32, Array32]:
     """(n, 3) lengths at which rays enter and leave the three pairs of planes of a box."""
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray along a plane never meets it: infinity
         to_low = (low.astype(np.float32) - start) / rays
@@ -112,14 +109,14 @@ def _slabs(start: Image, rays: Image, low: Array, high: Array) -> tuple[Image, I
     return np.minimum(to_low, to_high), np.maximum(to_low, to_high)
 
 
-def _exit(start: Image, rays: Image, low: Array, high: Array) -> tuple[Image, NDArray[np.int64]]:
+def _exit(start: Array32, rays: Array32, low: Array, high: Array) -> tuple[Array32, Index]:
     """Length (n,) at which rays from inside a box leave it, and across which axis."""
     _, leave = _slabs(start, rays, low, high)
     axis = leave.argmin(axis=-1)
     return np.take_along_axis(leave, axis[..., None], axis=-1)[..., 0], axis
 
 
-def _entry(start: Image, rays: Image, low: Array, high: Array) -> tuple[Image, NDArray[np.int64], NDArray[np.bool_]]:
+def _entry(start: Array32, rays: Array32, low: Array, high: Array) -> tuple[Array32, Index, Mask]:
     """Length (n,) at which rays enter a box from outside, across which axis, and whether they do."""
     enter, leave = _slabs(start, rays, low, high)
     axis = enter.argmax(axis=-1)
@@ -127,7 +124,7 @@ def _entry(start: Image, rays: Image, low: Array, high: Array) -> tuple[Image, N
     return near, axis, (near < leave.min(axis=-1)) & (near > 0)
 
 
-def _walls(points: Image, axis: NDArray[np.int64], texture: Image) -> Image:
+def _walls(points: Array32, axis: Index, texture: Array32) -> Array32:
     """(n, 3) colours of points on the walls, the floor and the ceiling."""
     level = points[..., 2]
     colours = np.empty_like(points)
@@ -138,9 +135,7 @@ def _walls(points: Image, axis: NDArray[np.int64], texture: Image) -> Image:
     return colours * _shade(points, axis, texture)
 
 
-def _box_colour(
-    box: room.Box, points: Image, axis: NDArray[np.int64], lines: NDArray[np.bool_], texture: Image
-) -> Image:
+def _box_colour(box: room.Box, points: Array32, axis: Index, lines: Mask, texture: Array32) -> Array32:
     """(n, 3) colours of points on a box, some of them on the lines of the table."""
     colours = np.empty_like(points)
     colours[...] = box.colour
@@ -150,7 +145,7 @@ def _box_colour(
     return colours * _shade(points, axis, texture)
 
 
-def _shade(points: Image, axis: NDArray[np.int64], texture: Image) -> Image:
+def _shade(points: Array32, axis: Index, texture: Array32) -> Array32:
     """(n, 1) light on points of faces across an axis, times the texture there."""
     across = np.array([[1, 2], [0, 2], [0, 1]])[axis]
     places = np.take_along_axis(points, across, axis=-1) * np.float32(TEXELS_PER_METRE)
@@ -161,7 +156,7 @@ def _shade(points: Image, axis: NDArray[np.int64], texture: Image) -> Image:
     return np.asarray(light[..., None], dtype=np.float32)
 
 
-def _texture(rng: np.random.Generator) -> Image:
+def _texture(rng: np.random.Generator) -> Array32:
     """(side, side) smooth noise that repeats, mean 0, standard deviation 1: four octaves."""
     total = np.zeros((TEXTURE_SIDE, TEXTURE_SIDE), dtype=np.float32)
     for cells, weight in ((4, 1.0), (16, 0.7), (64, 0.5), (256, 0.35)):

@@ -11,7 +11,6 @@ from typing import Any, Final
 import cv2
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from ballfg.checks import listed, shown, type_name
 from ballfg.files.strict_yaml import read_mapping
@@ -19,21 +18,13 @@ from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.renderer import Renderer
-from ballfg.simulation.scene.room import inside
-from ballfg.simulation.scene.shutter import (
-    PATH_POINTS,
-    Flight,
-    Frames,
-    Passage,
-    duration,
-    fly_shots,
-    frames_of,
-    passages_of,
-)
+from ballfg.simulation.scene.shutter import PATH_POINTS, Flight, Frames, Passage, fly_shots, frames_of, passages_of
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter
+from ballfg.vision.arrays import Image
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
+from ballfg.vision.detection.video import write_video
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +41,7 @@ class Recording:
         """The clock of the camera with this name."""
         return self.config.clocks.get(name, Clock())
 
-    def images(self, number: int) -> Iterator[NDArray[np.uint8]]:
+    def images(self, number: int) -> Iterator[Image]:
         """Images (h, w, 3) in grey levels, blue green red, of the camera with this number, frame by frame."""
         renderer = Renderer(self.config, self.cameras[number], number)
         return renderer.frames(self.frames[number], self.passages[number])
@@ -74,8 +65,7 @@ def record(config: SceneConfig, cameras: Sequence[Camera]) -> Recording:
         if name not in names:
             raise ValueError(f"clocks must be of cameras {listed(names)}; got one of {shown(name)}. Rename it.")
     flights = fly_shots(config)
-    until = duration(flights)
-    frames = [frames_of(config, camera, number, until) for number, camera in enumerate(cameras)]
+    frames = [frames_of(config, camera, number, flights) for number, camera in enumerate(cameras)]
     passages = [tuple(passages_of(config, flights, taken)) for taken in frames]
     return Recording(config, tuple(cameras), tuple(flights), tuple(frames), tuple(passages))
 
@@ -92,25 +82,22 @@ def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for passage in recording.passages[number]:
         pixels = camera.project(passage.paths)
-        seen = inside(camera, pixels[:, PATH_POINTS // 2])
+        seen = camera.holds(pixels[:, PATH_POINTS // 2])
         pixels, frame = pixels[seen], passage.frames[seen]
         focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
         radius = focal * recording.config.ball.ball.radius / camera.depth(passage.centres[seen])
         ends = {"": PATH_POINTS // 2, "_open": 0, "_close": -1}
         places = {f"{axis}{end}": pixels[:, place, k] for end, place in ends.items() for k, axis in enumerate("uv")}
         row = {"frame": frame, "t": frames.stamps[frame], "t_true": frames.times[frame]}
-        whole = np.asarray(inside(camera, pixels, radius[:, None]).all(axis=1), dtype=np.int64)
+        whole = np.asarray(camera.holds(pixels, radius[:, None]).all(axis=1), dtype=np.int64)
         row |= {"trajectory": np.full(len(frame), passage.name), **places, "radius": radius, "whole": whole}
         rows.append(row)
     return {"camera": camera.name} | {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
 
 
-Pixels = NDArray[np.uint8]
-
 SCENE_FILE: Final = "scene.yaml"
 TRUTH_RATE: Final = 1000.0
 """Hz, rows of `truth.csv`: between them a line is off by less than 2 micrometres, except over a bounce."""
-CODEC: Final = "mp4v"  # MPEG-4 part 2: every build of OpenCV writes and reads it
 
 
 def write_scene(
@@ -195,7 +182,7 @@ def scene_content(recording: Recording) -> dict[str, Any]:
 
 
 def _write_images(
-    stage: Path, camera: Camera, rate: float, drawn: Iterator[Pixels], count: int, *, images: bool
+    stage: Path, camera: Camera, rate: float, drawn: Iterator[Image], count: int, *, images: bool
 ) -> None:
     """Takes the next `count` images and writes them as one video, or as files of a folder."""
     if images:
@@ -205,15 +192,8 @@ def _write_images(
             if not cv2.imwrite(str(path), next(drawn)):
                 raise OSError(f"{path}: OpenCV could not write the image. Check the space on the disk.")
         return
-    path = stage / f"{camera.name}.mp4"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate, camera.size)
-    if not writer.isOpened():
-        raise OSError(f"{path}: OpenCV cannot write {CODEC} videos here. Write images instead.")
-    try:
-        for _ in range(count):
-            writer.write(next(drawn))
-    finally:
-        writer.release()
+    video = itertools.islice(drawn, count)
+    write_video(stage / f"{camera.name}.mp4", video, rate, camera.size, "Write images instead.")
 
 
 def _write_truth(path: Path, recording: Recording) -> None:

@@ -13,7 +13,6 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.simulation.scene.backdrop import backdrop
@@ -21,10 +20,8 @@ from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.scene.room import Colour, Rect, clipped, draw, grown, movers
 from ballfg.simulation.scene.shutter import Frames, Passage
 from ballfg.simulation.streams import Purpose, generator
+from ballfg.vision.arrays import Array32, Image
 from ballfg.vision.camera import Camera
-
-Image = NDArray[np.float32]
-Pixels = NDArray[np.uint8]
 
 LENS_BLUR: Final = 0.7  # px, standard deviation of the point spread of the lens
 _REACH: Final = 3  # px, extent of the blur: four standard deviations
@@ -58,7 +55,7 @@ class Renderer:
         shape = (camera.size[1] + NOISE_MARGIN, camera.size[0] + NOISE_MARGIN, 3)
         self._field = self._rng.standard_normal(shape, dtype=np.float32)
 
-    def frames(self, frames: Frames, passages: Sequence[Passage]) -> Iterator[Pixels]:
+    def frames(self, frames: Frames, passages: Sequence[Passage]) -> Iterator[Image]:
         """The images (h, w, 3) of a camera's frames, blue green red, one after the other."""
         at_frame: dict[int, list[Array]] = {}
         for passage in passages:
@@ -67,7 +64,7 @@ class Renderer:
         for frame, time in enumerate(frames.times.tolist()):
             yield self.draw(time, at_frame.get(frame, []))
 
-    def draw(self, time: float, paths: Sequence[Array]) -> Pixels:
+    def draw(self, time: float, paths: Sequence[Array]) -> Image:
         """One frame.
 
         Args:
@@ -108,7 +105,7 @@ class Renderer:
         self._sigma[window] = self._noise_level(part)
         return outer
 
-    def _developed(self, time: float) -> Pixels:
+    def _developed(self, time: float) -> Image:
         """The image in the light of the moment, with noise, in eight bits."""
         light = 1 + self._config.flicker * np.sinc(MAINS * self._config.exposure) * np.sin(2 * np.pi * MAINS * time)
         x, y = self._rng.integers(0, NOISE_MARGIN, 2).tolist()
@@ -117,12 +114,12 @@ class Renderer:
         image = cv2.addWeighted(self._image, float(light), self._grain, 1.0, 0.0, dtype=cv2.CV_8U)
         return np.asarray(image, dtype=np.uint8)
 
-    def _noise_level(self, image: Image) -> Image:
+    def _noise_level(self, image: Array32) -> Array32:
         """(h, w, 3) grey levels, standard deviation of the noise of pixels."""
         return np.asarray(np.float32(self._config.noise) * np.sqrt(1 + image / np.float32(MIDDLE_GREY)))
 
 
-def _blurred(image: Image) -> Image:
+def _blurred(image: Array32) -> Array32:
     side = 2 * _REACH + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), LENS_BLUR, borderType=cv2.BORDER_REPLICATE))
 
@@ -170,8 +167,7 @@ def ball_image(camera: Camera, path: Array, radius: float) -> BallImage | None:
 
 def _unit_rays(camera: Camera, pixels: Array) -> Array:
     """(h, w, 3) unit vectors in the camera's frame."""
-    plane = camera.normalized(pixels)
-    rays = np.concatenate((plane, np.ones((*plane.shape[:-1], 1))), axis=-1)
+    rays = camera.directions(pixels)
     return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 

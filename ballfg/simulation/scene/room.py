@@ -49,7 +49,7 @@ class Box:
 
 
 def furniture(kind: BallKind) -> list[Box]:
-    """The furniture of the room: the table on its legs, the launcher, a bench, posters at the walls."""
+    """The furniture of the room: the table, then its legs, the launcher, a bench, posters at the walls."""
     if kind.surfaces.extent is None:
         raise ValueError("surfaces must have an extent to be drawn as a table; got None. Use a ball over a table.")
     x0, x1, y0, y1 = kind.surfaces.extent
@@ -70,31 +70,21 @@ def furniture(kind: BallKind) -> list[Box]:
     return boxes
 
 
-def is_line(kind: BallKind, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.bool_]:
+def is_line(table: Box, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.bool_]:
     """True for points of the playing surface, x and y in m, on a white line."""
-    if kind.surfaces.extent is None:
-        return np.zeros(np.shape(x), dtype=bool)
-    x0, x1, y0, y1 = kind.surfaces.extent
+    (x0, y0, _), (x1, y1, _) = table.low.tolist(), table.high.tolist()
     edge = np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y)) < LINE_WIDTH
     return np.asarray(edge | (np.abs(y - (y0 + y1) / 2) < MIDDLE_LINE_WIDTH / 2))
 
 
-def middle_line(kind: BallKind) -> Array:
+def middle_line(table: Box) -> Array:
     """(n, 3) m, points along the line that halves the table, a millimetre apart: it may be thinner than a pixel."""
-    if kind.surfaces.extent is None:
-        return np.zeros((0, 3))
-    x0, x1, y0, y1 = kind.surfaces.extent
+    (x0, y0, _), (x1, y1, top) = table.low.tolist(), table.high.tolist()
     x = np.arange(x0, x1, 0.001)
-    return np.column_stack((x, np.full_like(x, (y0 + y1) / 2), np.full_like(x, kind.surfaces.table_height)))
+    return np.column_stack((x, np.full_like(x, (y0 + y1) / 2), np.full_like(x, top)))
 
 
 Rect = tuple[int, int, int, int]  # Left, top, right, bottom in pixels; right and bottom are the first ones outside
-
-
-def inside(camera: Camera, pixels: Array, reach: Array | float = 0.0) -> NDArray[np.bool_]:
-    """(...) True for discs of radius `reach` (...) px about pixels (..., 2) inside the image; False for NaN."""
-    reach = np.asarray(reach)[..., None]
-    return np.asarray(((pixels - reach >= -0.5) & (pixels + reach < np.array(camera.size) - 0.5)).all(axis=-1))
 
 
 def clipped(camera: Camera, pixels: Array, margin: float) -> Rect | None:

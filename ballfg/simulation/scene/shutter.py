@@ -33,16 +33,11 @@ START_SPREAD: Final = 0.05  # s, spread of launches about their interval, so tha
 class Flight:
     """One ball, from its launch to the end of its track, in true time."""
 
-    name: str
-    """Of the track."""
-    start: float
-    """s, true time of the launch."""
-    knots: Array
-    """(k, 9) states every 1 / `KNOT_RATE` s from the launch on."""
-    model: AnalyticModel = field(repr=False)
-    """Model of its motion."""
-    surfaces: Surfaces = field(repr=False)
-    """Its surfaces."""
+    name: str  # of the track
+    start: float  # s, true time of the launch
+    knots: Array  # (k, 9) states every 1 / `KNOT_RATE` s from the launch on
+    model: AnalyticModel = field(repr=False)  # model of its motion
+    surfaces: Surfaces = field(repr=False)  # its surfaces
 
     @property
     def end(self) -> float:
@@ -86,11 +81,6 @@ def fly_shots(config: SceneConfig) -> list[Flight]:
     ]
 
 
-def duration(flights: list[Flight]) -> float:
-    """True time in s at which a recording of these flights ends; it begins at zero."""
-    return max(flight.end for flight in flights) + BEFORE
-
-
 PATH_POINTS: Final = 17
 """Number of points of a ball's path through one exposure, the first at the opening, the last at the closing, the middle
 one at the stamp. Sixteen chords: a bounce within 2 ms is off by less than 0.1 mm over one of them."""
@@ -129,14 +119,15 @@ def free_running(names: Sequence[str], rate: float, seed: int) -> dict[str, Cloc
     return {name: Clock(phase=float(p / len(names) / rate)) for name, p in zip(names, place, strict=True)}
 
 
-def frames_of(config: SceneConfig, camera: Camera, number: int, until: float) -> Frames:
-    """The frames of a camera from its first one on.
+def frames_of(config: SceneConfig, camera: Camera, number: int, flights: Sequence[Flight]) -> Frames:
+    """The frames of a camera from its first one to the end of the recording, soon after that of the last flight.
 
     Args:
         config: rate, clocks, dropped frames, jitter.  camera: for its name and its known time offset.
-        number: of the camera in its rig; it picks the random streams.  until: s, true time of the end of the recording.
+        number: of the camera in its rig; it picks the random streams.
     """
     clock = config.clocks.get(camera.name, Clock())
+    until = max(flight.end for flight in flights) + BEFORE
     count = int(np.floor((until - clock.phase) * config.rate)) + 1
     kept = generator(config.seed, Purpose.SCENE_DROPOUT, number).random(count) >= config.dropout
     kept[0] = True

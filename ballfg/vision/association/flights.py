@@ -4,7 +4,7 @@ Between bounces a ball's acceleration is gravity, drag and lift; a waved arm's i
 continuation of the first meets that of the second in the gap, with a kink where the ball bounced or was hit.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import permutations
 from typing import Final
 
@@ -114,11 +114,7 @@ def _continued(track: Path, times: Array, last: bool) -> tuple[Array, Array, Arr
 
 def successions(tracks: Sequence[Path]) -> list[tuple[int, int]]:
     """Pairs (earlier, later) of tracks of one flight, best first; no track is twice on the same side."""
-    return best_pairs({(i, j): meeting(tracks[i], tracks[j]) for i, j in permutations(range(len(tracks)), 2)})
-
-
-def best_pairs(costs: Mapping[tuple[int, int], float | None]) -> list[tuple[int, int]]:
-    """Pairs by their costs, dimensionless, least first; None: not a pair. No number is twice on the same side."""
+    costs = {(i, j): meeting(tracks[i], tracks[j]) for i, j in permutations(range(len(tracks)), 2)}
     pairs: list[tuple[int, int]] = []
     for _, (i, j) in sorted((cost, pair) for pair, cost in costs.items() if cost is not None):
         if all(i != earlier and j != later for earlier, later in pairs):

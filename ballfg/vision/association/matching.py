@@ -191,9 +191,8 @@ def epipolar_miss(first: Camera, second: Camera, pixels: Array, others: Array) -
     """
     known = np.isfinite(pixels).all(axis=1) & np.isfinite(others).all(axis=1)
     miss, gradient = np.full(len(pixels), np.nan), np.full((len(pixels), 4), np.nan)
-    ones = np.ones((int(known.sum()), 1))
-    rays = np.concatenate((first.normalized(pixels[known]), ones), axis=1) @ first.rotation
-    towards = np.concatenate((second.normalized(others[known]), ones), axis=1) @ second.rotation
+    rays = first.directions(pixels[known]) @ first.rotation
+    towards = second.directions(others[known]) @ second.rotation
     between = second.centre - first.centre
     normal, other_normal = np.cross(between, towards), np.cross(rays, between)
     by_first = normal @ first.rotation[:2].T / first.matrix[[0, 1], [0, 1]]

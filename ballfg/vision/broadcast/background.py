@@ -11,20 +11,14 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.vision.arrays import Image
 
-MOST: Final = 400
-"""Points that are followed from one picture to the next."""
-QUALITY, APART = 0.005, 12.0
-"""Of corners: least share of the best one's strength; least distance, px."""
-BACK: Final = 0.7
-"""px by which a point that is followed forth and back may miss itself."""
-ALIKE: Final = 1.5
-"""px about a homography within which a point is background."""
+MOST: Final = 400  # points that are followed from one picture to the next
+QUALITY, APART = 0.005, 12.0  # of corners: least share of the best one's strength; least distance, px
+BACK: Final = 0.7  # px by which a point that is followed forth and back may miss itself
+ALIKE: Final = 1.5  # px about a homography within which a point is background
 FEWEST, SHARE = 25, 0.35
 """Background points, and their share of those that were followed, at least, of pictures that follow each other."""
-KEPT: Final = 60
-"""Background points of a pair that are kept, spread over the picture."""
-WINDOW, LEVELS = (21, 21), 4
-"""px, and pyramid levels, of Lucas and Kanade's method: pans reach 40 px a picture."""
+KEPT: Final = 60  # background points of a pair that are kept, spread over the picture
+WINDOW, LEVELS = (21, 21), 4  # px, and pyramid levels, of Lucas and Kanade's method: pans reach 40 px a picture
 
 
 @dataclass(frozen=True, eq=False)

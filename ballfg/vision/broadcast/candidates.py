@@ -26,29 +26,21 @@ from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.detection.detector import Colour
 
-NEAR, FAR = 1, 4
-"""Pictures before and after, with which a picture is compared."""
-BRIGHTER: Final = 14.0
-"""Grey levels by which a pixel of a candidate is brighter, in the least of the three colours."""
-PEAK: Final = 24.0
-"""The same for its brightest pixel: a fast ball over white letters has 40."""
+NEAR, FAR = 1, 4  # pictures before and after, with which a picture is compared
+BRIGHTER: Final = 14.0  # grey levels by which a pixel of a candidate is brighter, in the least of the three colours
+PEAK: Final = 24.0  # the same for its brightest pixel: a fast ball over white letters has 40
 THIN, THICK = 0.4, 2.2
 """Width of a candidate in diameters of the ball at that place, at least and at most: blur and compression widen it."""
-LONGEST: Final = 60.0
-"""px, of a bar."""
-LEAST: Final = 3
-"""Pixels of a candidate."""
-MOST: Final = 60
-"""Candidates of a picture, those with the highest scores."""
+LONGEST: Final = 60.0  # px, of a bar
+LEAST: Final = 3  # pixels of a candidate
+MOST: Final = 60  # candidates of a picture, those with the highest scores
 ROOM: Final = (3.5, 3.0)
 """Half lengths and half widths of the court about which balls are seen: they bound the ball's size."""
 SIGMA: Final = 0.6
 """px, standard deviation of a candidate's centre across a bar; along it a share of the bar's length is added."""
 ALONG: Final = 0.06
-BALLS: Final[tuple[Colour, ...]] = ("white", "orange")
-"""Colours of balls, in the order in which they are looked for."""
-VISIBLE: Final = 3.0
-"""px, of a bar whose direction shows."""
+BALLS: Final[tuple[Colour, ...]] = ("white", "orange")  # colours of balls, in the order in which they are looked for
+VISIBLE: Final = 3.0  # px, of a bar whose direction shows
 
 
 def find_candidates(

@@ -13,12 +13,10 @@ from ballfg.tracks import csv_files
 from ballfg.vision.calibration.table_points import TABLE_HEIGHT, TABLE_LENGTH, TABLE_WIDTH
 
 TABLE_TENNIS: Final = "table-tennis"
-LINE_WIDTH: Final = 0.02
-"""m (ITTF Laws 2.1.4); the middle line of doubles has 3 mm."""
+LINE_WIDTH: Final = 0.02  # m (ITTF Laws 2.1.4); the middle line of doubles has 3 mm
 NET_HEIGHT, NET_REACH = 0.1525, 0.1525
 """m, of the net above the table, and of its posts beyond the side lines (ITTF Laws 2.2)."""
-LARGEST: Final = 200.0
-"""m, of a coordinate."""
+LARGEST: Final = 200.0  # m, of a coordinate
 CORNERS: Final = 4
 
 

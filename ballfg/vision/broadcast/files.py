@@ -8,13 +8,10 @@ from ballfg.tracks.info import INFO_FILE
 from ballfg.vision.camera_file import CAMERAS_FILE
 
 STATES, MOTION, EVENTS, STROKES = "states.csv", "camera_motion.csv", EVENTS_FILE, "strokes.csv"
-COURT: Final = "court.yaml"
-"""The court, as a user gave it; without this file it is that of table tennis."""
-FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES, COURT)
-"""All written files."""
+COURT: Final = "court.yaml"  # the court, as a user gave it; without this file it is that of table tennis
+FILES: Final = (INFO_FILE, STATES, DETECTIONS_FILE, CAMERAS_FILE, MOTION, EVENTS, STROKES, COURT)  # all written files
 VIDEOS: Final = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi")
-TRACKED: Final = "ballfg track "
-"""Before the name of the video in the source of a rally's dataset."""
+TRACKED: Final = "ballfg track "  # before the name of the video in the source of a rally's dataset
 
 
 def is_rally(folder: Path) -> bool:

@@ -20,36 +20,24 @@ from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.lines import moved, sampled, slopes
 from ballfg.vision.broadcast.pinhole import Pinhole, posed
 
-SHORTEST: Final = 0.02
-"""Of the image's diagonal: a shorter segment is not used."""
-MOST_LINES: Final = 90
-"""Longest ones that are combined."""
+SHORTEST: Final = 0.02  # of the image's diagonal: a shorter segment is not used
+MOST_LINES: Final = 90  # longest ones that are combined
 SAME: Final = 2.0
 """px between the ends of lines, or the corners of courts, that are one: a picture's brightness and its strongest colour
 show most lines twice."""
 PARALLEL, ASIDE, GAPS = 0.03, 2.0, (0.15, 0.6)
 """rad and px by which segments of one line differ; the gap between them, of the longer one. A wide gap bridges a player
 before an edge, but continues another edge with what lies in its direction on the floor: lines of both are combined."""
-OPEN: Final = (8.0, 0.12)
-"""px, and share of a segment's length, by which it may end before a corner or pass it."""
-SMALLEST: Final = 0.004
-"""Of the image's area."""
-FOCALS: Final = np.geomspace(0.5, 10.0, 22)
-"""Focal lengths that are tried, of the image's width."""
-ROUNDS: Final = 8
-"""Steps in which the camera of a quadrilateral is found from the best of them."""
-MISSED: Final = 0.03
-"""Of the quadrilateral's size: the corners' error by which a pinhole camera may miss them."""
-UPRIGHT: Final = 0.35
-"""rad by which a camera may be tilted to the side."""
-DISTANCES: Final = (1.0, 60.0)
-"""Of the court's half length."""
-ALONG: Final = 2.0
-"""Ratio of x to y from which a camera looks along the court."""
-EDGE: Final = 12.0
-"""Grey levels a px: least slope of an edge."""
-ACROSS: Final = (-2.0, -1.0, 0.0, 1.0, 2.0)
-"""px from a line of the court in which its edge is looked for."""
+OPEN: Final = (8.0, 0.12)  # px, and share of a segment's length, by which it may end before a corner or pass it
+SMALLEST: Final = 0.004  # of the image's area
+FOCALS: Final = np.geomspace(0.5, 10.0, 22)  # focal lengths that are tried, of the image's width
+ROUNDS: Final = 8  # steps in which the camera of a quadrilateral is found from the best of them
+MISSED: Final = 0.03  # of the quadrilateral's size: the corners' error by which a pinhole camera may miss them
+UPRIGHT: Final = 0.35  # rad by which a camera may be tilted to the side
+DISTANCES: Final = (1.0, 60.0)  # of the court's half length
+ALONG: Final = 2.0  # ratio of x to y from which a camera looks along the court
+EDGE: Final = 12.0  # grey levels a px: least slope of an edge
+ACROSS: Final = (-2.0, -1.0, 0.0, 1.0, 2.0)  # px from a line of the court in which its edge is looked for
 
 
 def find_court(image: Image, court: Court) -> list[tuple[Pinhole, float]]:
@@ -180,13 +168,7 @@ def cameras_of(quads: Array, court: Court, size: tuple[int, int]) -> list[Pinhol
                 one = _fitted(one, court, seen)
                 missed = np.linalg.norm(one.project(court.corners) - seen, axis=1)
                 found += [one] if (missed < MISSED * scale).all() else []  # NaN: one is behind the camera
-    return [_in_front(one) for one in found if _possible(*_views(one, court), court).all()]
-
-
-def _views(camera: Pinhole, court: Court) -> tuple[Array, Array, Array]:
-    """Turn, place, and the court's corners in the camera's frame, (1, ...) each."""
-    at = (court.corners - camera.place) @ camera.turn.T
-    return camera.turn[None], camera.place[None], at[None]
+    return [_in_front(one) for one in found if _possible(one.turn[None], one.place[None], court).all()]
 
 
 def _fitted(camera: Pinhole, court: Court, seen: Array) -> Pinhole:
@@ -214,7 +196,7 @@ def _first(plane: Array, seen: Array, court: Court, size: tuple[int, int]) -> Pi
     at = (court.corners - place[:, None]) @ turn.swapaxes(1, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         missed = np.linalg.norm(focal[:, None, None] * at[..., :2] / at[..., 2:] - seen, axis=2).max(axis=1)
-    missed[~_possible(turn, place, at, court)] = np.inf
+    missed[~_possible(turn, place, court)] = np.inf
     best = int(np.argmin(missed))
     return Pinhole(turn[best], place[best], float(focal[best]), size) if np.isfinite(missed[best]) else None
 
@@ -228,11 +210,12 @@ def _in_front(camera: Pinhole) -> Pinhole:
     return replace(camera, turn=camera.turn * half, place=camera.place * half)
 
 
-def _possible(turn: Array, place: Array, at: Array, court: Court) -> Mask:
+def _possible(turn: Array, place: Array, court: Court) -> Mask:
     """(m,) bool: cameras above the court, upright, at a distance from which courts are filmed."""
     up = -turn[:, 1, 2]  # of the world's z, upwards in the picture
     tilted = np.abs(np.arctan2(turn[:, 0, 2], up))
     reach = np.linalg.norm(place, axis=1) / court.size[0]
+    at = (court.corners - place[:, None]) @ turn.swapaxes(1, 2)
     near = (reach > DISTANCES[0]) & (reach < DISTANCES[1])
     return np.asarray((place[:, 2] > 0.0) & (at[..., 2] > 0.0).all(axis=1) & (tilted < UPRIGHT) & near)
 

@@ -21,13 +21,12 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.vision.broadcast.background import Match
-from ballfg.vision.broadcast.lines import Ridges
+from ballfg.vision.broadcast.lines import ROBUST, Ridges
 from ballfg.vision.broadcast.measured import (
     LENS,
     LINES,
     NEAR,
     READOUT,
-    ROBUST,
     Background,
     CourtLines,
     Flow,
@@ -41,21 +40,18 @@ from ballfg.vision.broadcast.pinhole import Pinhole
 
 RIDGE_SIGMA, MATCH_SIGMA = 0.1, 0.15
 """px, of a ridge's place and of a background point's motion, at first; then what the recording shows, line by line."""
-LEAST_SIGMA: Final = 0.01
-"""px, of these."""
+LEAST_SIGMA: Final = 0.01  # px, of these
 LINE_SIGMA, LINES_KNOWN = 0.05, 4.0
 """px, by which a line is off in all pictures, at first: it was painted so, or its net sags, or the ground beside it
 moves it; then what the lines show, with this as that of so many lines more."""
-ROUNDS: Final = 3
-"""In which the noise is found."""
+ROUNDS: Final = 3  # in which the noise is found
 STEPS, ROUGH, SETTLED = 30, 1e-3, 1e-5
 """Of the minimiser at most, and the relative change of the sum of squares that ends it, while the noise is looked for
 and at last."""
 PLACE_SIGMA, FOCAL_SIGMA, BEND_SIGMA, NEAR_SIGMA = 30.0, 1.0, 0.1, 0.1
 """m, and of the logarithm: priors about the first values, far wider than what the court tells. Of k1, about none:
 lenses of broadcasts have up to 0.2. Of one over the background's distance, 1/m, about none."""
-WALK, WALKS = 0.003, 2
-"""m, from one picture to the next, at first, of a camera that moves; rounds in which it is found."""
+WALK, WALKS = 0.003, 2  # m, from one picture to the next, at first, of a camera that moves; rounds in which it is found
 READOUTS: Final = 0.5
 """Of the time between pictures, prior standard deviation of the readout of a rolling shutter, about none."""
 SURE: Final = 3.0

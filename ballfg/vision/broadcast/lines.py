@@ -18,32 +18,22 @@ from ballfg.vision.arrays import Array32, Image
 from ballfg.vision.broadcast.court import Court
 from ballfg.vision.broadcast.pinhole import Pinhole
 
-SAMPLES: Final = 24
-"""Along a line of the court."""
-STEP: Final = 0.5
-"""px between values along a normal."""
-FLANK, BESIDE = 4.0, 2.5
-"""px from the middle of a line, and from the edge of a wide one, to the ground beside it."""
-CROSSING: Final = 2.0
-"""Of the flank, from another line within which it is in the way."""
-RIDGE: Final = 6.0
-"""Grey levels by which a line is brighter than the ground, at least."""
+SAMPLES: Final = 24  # along a line of the court
+STEP: Final = 0.5  # px between values along a normal
+FLANK, BESIDE = 4.0, 2.5  # px from the middle of a line, and from the edge of a wide one, to the ground beside it
+CROSSING: Final = 2.0  # of the flank, from another line within which it is in the way
+RIDGE: Final = 6.0  # grey levels by which a line is brighter than the ground, at least
 LEANING, SHARP = 0.1305, 2.4
 """Of the step between the grounds, by which the halfway places of a line that is far narrower than its blur differ from
 where they should be (Phi(sqrt(2 log 2)) - 3/4); the power of the share of the width that is not blur with which this
 vanishes, as of a bar blurred by a Gaussian to a tenth."""
 SIGMA: Final = 0.7
 """px, standard deviation of a ridge about the camera of one picture alone: more than that of its place."""
-ROBUST: Final = 2.0
-"""Scale of Cauchy's loss on a ridge, in standard deviations."""
-FOCAL_SIGMA: Final = 0.5
-"""Of the logarithm of a focal length in one picture, about the first value."""
-REACHES: Final = (8.0, 5.0, 3.0, 3.0)
-"""px, in which ridges are looked for, turn by turn."""
-CLOSE: Final = 1.5
-"""px within which a ridge fits."""
-EVERY: Final = np.arange(7)
-"""Numbers of turn, place and log focal length of a camera."""
+ROBUST: Final = 2.0  # scale of Cauchy's loss on a ridge or on the background, in standard deviations
+FOCAL_SIGMA: Final = 0.5  # of the logarithm of a focal length in one picture, about the first value
+REACHES: Final = (8.0, 5.0, 3.0, 3.0)  # px, in which ridges are looked for, turn by turn
+CLOSE: Final = 1.5  # px within which a ridge fits
+EVERY: Final = np.arange(7)  # numbers of turn, place and log focal length of a camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,21 +9,19 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.vision.broadcast.background import Match
-from ballfg.vision.broadcast.lines import Ridges
+from ballfg.vision.broadcast.lines import ROBUST, Ridges
 from ballfg.vision.broadcast.pinhole import Pinhole, undone
 
 SHARED, TOGETHER = 10.0, 40.0
 """Ridges of a line, in a picture and in those after it, err together, and matches of neighbouring points do: so many
 count as one. Rendered seeds 700 - 718 and the real rally chose it."""
-ROBUST: Final = 2.0
-"""Scale of Cauchy's loss, in standard deviations."""
 LENS, LINES, NEAR, READOUT = (gtsam.symbol(letter, 0) for letter in "lcws")
 
 

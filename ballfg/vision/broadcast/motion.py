@@ -22,28 +22,18 @@ from ballfg.vision.broadcast.lines import REACHES, Ridges, brightness, corrected
 from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.one_thread import one_thread
 
-Frames = Callable[[], Iterator[tuple[float, Image]]]
-"""Opens a video and gives stamps (s) and images (h, w, 3), BGR."""
-Pair = tuple[Image | None, Image]
-"""The picture before, if there is one, and a picture."""
-EVERY: Final = 0.5
-"""s between the pictures in which the court is looked for."""
-SEEDS: Final = 4
-"""Pictures of a shot in which it is found, after which it is followed only."""
-TRIED: Final = 30
-"""Quadrilaterals of a picture that are compared by all lines."""
-FITS: Final = 0.7
-"""Share of the court's lines without which a picture does not show the court."""
+Frames = Callable[[], Iterator[tuple[float, Image]]]  # opens a video and gives stamps (s) and images (h, w, 3), BGR
+Pair = tuple[Image | None, Image]  # the picture before, if there is one, and a picture
+EVERY: Final = 0.5  # s between the pictures in which the court is looked for
+SEEDS: Final = 4  # pictures of a shot in which it is found, after which it is followed only
+TRIED: Final = 30  # quadrilaterals of a picture that are compared by all lines
+FITS: Final = 0.7  # share of the court's lines without which a picture does not show the court
 FOLLOWED: Final = 0.45
 """The same where the camera before and the background foretell it: a player may stand before a line."""
-SHORTEST: Final = 10
-"""Pictures of a shot; a shorter one is not used."""
-TURNED: Final = np.r_[0:3, 6]
-"""Numbers of turn and log focal length among the seven of a camera."""
-ROUNDS: Final = 6
-"""Steps in which a camera takes over the motion of the background."""
-REACH: Final = 4.0
-"""px, in which ridges are looked for at last."""
+SHORTEST: Final = 10  # pictures of a shot; a shorter one is not used
+TURNED: Final = np.r_[0:3, 6]  # numbers of turn and log focal length among the seven of a camera
+ROUNDS: Final = 6  # steps in which a camera takes over the motion of the background
+REACH: Final = 4.0  # px, in which ridges are looked for at last
 
 
 @dataclass(frozen=True, eq=False)

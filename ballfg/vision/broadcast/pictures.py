@@ -25,10 +25,8 @@ from ballfg.vision.broadcast.pinhole import Pinhole
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
-SMALLER: Final = 0.25
-"""Of a picture that is compared."""
-BLOCK: Final = 4
-"""Of its pixels, whose mean is compared: compression changes single ones."""
+SMALLER: Final = 0.25  # of a picture that is compared
+BLOCK: Final = 4  # of its pixels, whose mean is compared: compression changes single ones
 SAME, SHARE = 3.0, 0.2
 """Grey levels, and share of the median, below which the largest change of a block is that of compression alone: it is
 1.6 at most in a real video written again with doubled pictures, where the least real change is 35."""
@@ -102,10 +100,8 @@ def _even(times: Array, repeats: Mask) -> Array:
     return np.asarray(times[kept[0]] + rate * passed)
 
 
-WIDTHS: Final = (960, 1280)
-"""px, between which pictures are as they are."""
-SPARE: Final = 40
-"""px of width, among which is one with a height that hardly needs rounding."""
+WIDTHS: Final = (960, 1280)  # px, between which pictures are as they are
+SPARE: Final = 40  # px of width, among which is one with a height that hardly needs rounding
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.projection import CHANGES, ZOOM, by_changes, changed
 
 ROUGHLY: Final = (1e-4, 0.3)  # Smallest and largest relative standard deviation of a focal length
-TRIED: Final = (0.0, -1.0, 1.0, -2.0, 2.0)
-"""Standard deviations of a focal length from which the search sets out."""
+TRIED: Final = (0.0, -1.0, 1.0, -2.0, 2.0)  # standard deviations of a focal length from which the search sets out
 ROUNDS: Final = 20
 HALVINGS: Final = 10  # of a step that does not lower the cost
 SETTLED: Final = 1e-6  # Standard deviations. A step that is shorter ends the search

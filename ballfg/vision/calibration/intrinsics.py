@@ -207,10 +207,10 @@ def _check_fit(name: str, fitted: Intrinsics) -> None:
         remedy = f"Take images with the board in its corners, or fewer coefficients than {coefficients}."
         raise ValueError(f"{where}: {rule}. {remedy}")
     camera, pixels = fitted.camera, pixel_grid(fitted.camera)
-    plane = camera.normalized(pixels)
-    again = camera.project(np.column_stack((plane, np.ones(len(plane)))))
+    directions = camera.directions(pixels)
+    again = camera.project(directions)
     apart = float(np.linalg.norm(again - pixels, axis=1).max())
-    if not apart <= MAX_FOLD or _has_pole(camera, float((plane**2).sum(axis=1).max())):
+    if not apart <= MAX_FOLD or _has_pole(camera, float((directions[:, :2] ** 2).sum(axis=1).max())):
         rule = "the distortion must be possible to undo; it folds a part of the image"
         remedy = f"Take images with the board in all its corners, or fewer coefficients than {coefficients}."
         raise ValueError(f"{where}: {rule}. {remedy}")
@@ -269,8 +269,7 @@ def sigma_of_rays(camera: Camera, covariance: Array) -> Array:
     """
     if not np.isfinite(covariance).all():
         return np.full(len(pixel_grid(camera)), np.inf)
-    plane = camera.normalized(pixel_grid(camera))
-    points = np.column_stack((plane, np.ones(len(plane))))
+    points = camera.directions(pixel_grid(camera))
     slopes = slopes_of(camera, points, np.zeros(3), np.zeros(3))
     turns, by_lens = slopes[:, :3], slopes[:, POSE:]
     q, _ = np.linalg.qr(turns)

@@ -50,7 +50,9 @@ def summary(found: Calibration) -> Iterator[str]:
         yield f"  place: {len(place.marked.names)} points, RMS {place.rms:.2f} px"
         if place.chance < UNLIKELY:
             chance = f"noise of {place.marked.sigma:g} px explains that with a chance of {place.chance:.0e}"
-            yield f"    note: {chance}. {_remedy(place)}"
+            found_too = place.camera.covariance is not None
+            further = "" if found_too else ", or find the focal length too, with --focal-sigma 0.05"
+            yield f"    note: {chance}. Check names and pixels{further}."
         yield (
             f"    at ({x:.3f}, {y:.3f}, {z:.3f}) m ± {1e3 * place.centre_sigma:.1f} mm, "
             f"turned ± {np.degrees(place.turn_sigma):.3f} degrees"
@@ -58,13 +60,6 @@ def summary(found: Calibration) -> Iterator[str]:
         if (covariance := place.camera.covariance) is not None:
             yield f"    focal length {place.camera.matrix[0, 0]:.1f} px ± {np.sqrt(covariance[-1, -1]):.1%}"
         yield "    px: " + ", ".join(f"{name} {error:.2f}" for name, error in errors)
-
-
-def _remedy(place: Extrinsics) -> str:
-    """What to do about residuals at table points that noise does not explain."""
-    if place.camera.covariance is not None:  # its focal length was found too
-        return "Check names and pixels."
-    return "Check names and pixels, or find the focal length too, with --focal-sigma 0.05."
 
 
 def _lens_lines(lens: Intrinsics) -> Iterator[str]:

@@ -42,7 +42,7 @@ def learn_detector(video: Video, settings: DetectorSettings | None = None) -> Ba
     if len(images) < FEWEST:
         rule = f"video {shown(video.name)} must have at least {FEWEST} frames to learn a background"
         raise ValueError(f"{rule}; got {len(images)}. Record longer, or leave the camera out.")
-    return BallDetector.learn(images, settings)
+    return BallDetector(images, settings)
 
 
 def load_detector(text: str) -> Maker:

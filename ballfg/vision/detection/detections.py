@@ -18,10 +18,8 @@ from ballfg.vision.arrays import Image
 from ballfg.vision.camera import Camera
 
 _SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2), "radii": (2,)}  # of each
-UNKNOWN_RADIUS: Final = (0.0, 1.0)
-"""px, in place of a radius and its standard deviation."""
-UNSIZED: Final = np.zeros((0, 2))
-"""In place of radii: all unknown."""
+UNKNOWN_RADIUS: Final = (0.0, 1.0)  # px, in place of a radius and its standard deviation
+UNSIZED: Final = np.zeros((0, 2))  # in place of radii: all unknown
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ The score marks the similarity of a candidate to a ball by shape, contrast, size
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, Self
+from typing import Final, Literal
 
 import numpy as np
 
@@ -62,17 +62,16 @@ class DetectorSettings:
 
 
 class BallDetector:
-    """Finds small fast balls before a background that hardly moves; one per camera, called with each frame in order."""
+    """Finds small fast balls before a background that hardly moves; one per camera, called with each frame in order.
 
-    def __init__(self, background: Background, settings: DetectorSettings | None = None) -> None:
-        self.background = background
+    Args: images: frames (h, w, 3), of which the background is learned.  settings: the default ones if None.
+    Raises: ValueError: too few frames, or of several sizes.
+    """
+
+    def __init__(self, images: Sequence[Image], settings: DetectorSettings | None = None) -> None:
+        self.background = Background(images)
         self.settings = settings or DetectorSettings()
         self._look = Look.unknown()
-
-    @classmethod
-    def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> Self:
-        """A detector with the background of frames (h, w, 3). Raises: ValueError: too few, or of several sizes."""
-        return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:
         """The candidates of the next frame (h, w, 3), BGR. Raises: ValueError: another size than the background's."""

@@ -187,6 +187,22 @@ def read_stamps(path: Path) -> Array:
     return np.array(stamps)
 
 
+def write_video(path: Path, frames: Iterator[Image], rate: float, size: tuple[int, int], instead: str) -> None:
+    """Writes frames (h, w, 3) as MPEG-4 part 2, which every build of OpenCV writes and reads.
+
+    Args: path: a new file.  rate: Hz.  size: width and height, px.  instead: what to do where OpenCV cannot write it.
+    Raises: OSError: the video cannot be written.
+    """
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+    if not writer.isOpened():
+        raise OSError(f"{path}: OpenCV cannot write this video. {instead}")
+    try:
+        for frame in frames:
+            writer.write(frame)
+    finally:
+        writer.release()
+
+
 def _capture(path: Path) -> cv2.VideoCapture:
     """Opens a video for decoding on one thread, since each camera has a core. Opening reads headers alone."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])

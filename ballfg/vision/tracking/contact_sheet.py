@@ -94,8 +94,7 @@ class ContactSheet:
         cameras = tracking.cameras[:MOST_VIEWS]
         for track in self._shown:
             seen = [tracking.seen(tracking.balls[track], camera) for camera in range(len(cameras))]
-            pairs = zip(seen, cameras, strict=True)
-            self._views.append([View(one.frames, one.pixels, model.size) for one, model in pairs])
+            self._views.append([View(*one, model.size) for one, model in zip(seen, cameras, strict=True)])
         if not self._shown:
             counts = [len(found.frames) for found in tracking.detections]
             sizes = [model.size for model in cameras]
@@ -127,7 +126,10 @@ class ContactSheet:
         panels = np.asarray(figure.subplots(rows, len(widths), squeeze=False, width_ratios=widths), dtype=object)
         for row, track, pictures in zip(panels, self._shown, self._views, strict=True):
             for camera, (panel, view) in enumerate(zip(row, pictures, strict=False)):
-                self._draw_view(panel, view, track, camera)
+                ball, model = self._tracking.balls[track], self._tracking.cameras[camera]
+                marks = self._tracking.seen(ball, camera)[1]
+                _show(panel, view.picture(marks, [bgr(track)] * len(marks), model.project(ball.points)))
+                panel.set_title(f"{drawn(model.name)}: {len(marks)} sightings", size=8)
             row[0].set_title(f"track {drawn(self._tracking.names[track])}     " + row[0].get_title(), size=8)
             self._draw_space(row[-2:], track)
         for panel in panels[-1, -2:]:
@@ -140,12 +142,6 @@ class ContactSheet:
             wrap=True,
         )
         return figure
-
-    def _draw_view(self, panel: Axes, view: View, track: int, camera: int) -> None:
-        ball, model = self._tracking.balls[track], self._tracking.cameras[camera]
-        marks = self._tracking.seen(ball, camera).pixels
-        _show(panel, view.picture(marks, [bgr(track)] * len(marks), model.project(ball.points)))
-        panel.set_title(f"{drawn(model.name)}: {len(marks)} sightings", size=8)
 
     def _draw_space(self, panels: Sequence[Axes], track: int) -> None:
         """The points with their standard deviations from the side and from above; one scale in all rows."""

@@ -19,6 +19,7 @@ from ballfg.vision.arrays import Image
 from ballfg.vision.association.gathering import nearest
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
+from ballfg.vision.detection.video import write_video
 from ballfg.vision.tracking.pipeline import Tracking
 
 VIEW_WIDTH: Final = 640  # px of one view: three side by side make 1920, the width of a screen
@@ -65,14 +66,8 @@ def write_overlay(
     """
     painter = OverlayPainter(tracking, table)
     moments = schedule(tracking.detections, tracking.cameras)
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), PLAYED_AT, painter.size)
-    if not video.isOpened():
-        raise OSError(f"{path}: OpenCV cannot write this video. Check the disk, or go without the overlay.")
-    try:
-        for frame in watch(painter.paint_all(moments, streams), len(moments.times), "overlay frames drawn"):
-            video.write(frame)
-    finally:
-        video.release()
+    frames = watch(painter.paint_all(moments, streams), len(moments.times), "overlay frames drawn")
+    write_video(path, frames, PLAYED_AT, painter.size, "Check the disk, or go without the overlay.")
     return len(moments.times)
 
 
@@ -140,8 +135,7 @@ class ViewPainter:
         self._alone, self._table = len(tracking.cameras) == 1, table
         self._used: dict[int, list[tuple[int, Array]]] = {}
         for track, ball in enumerate(tracking.balls):
-            seen = tracking.seen(ball, camera)
-            for frame, pixel in zip(seen.frames, seen.pixels, strict=True):
+            for frame, pixel in zip(*tracking.seen(ball, camera), strict=True):
                 self._used.setdefault(int(frame), []).append((track, pixel))
 
     def paint(self, image: Image | None, frame: int, time: float) -> Image:

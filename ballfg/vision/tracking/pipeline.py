@@ -25,14 +25,6 @@ DIGITS: Final = 3  # least number of digits in a track's name: names then sort a
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """One ball in one camera."""
-
-    frames: Index  # (m,) numbers of the camera's frames, increasing
-    pixels: Array  # (m, 2) px
-
-
-@dataclass(frozen=True, eq=False)
 class Tracking:
     """The balls of a recording."""
 
@@ -67,19 +59,19 @@ class Tracking:
         step = float(np.median(np.concatenate([np.diff(one) for one in times])))
         return float(f"{1.0 / step:.6g}")
 
-    def seen(self, ball: SeenBall, camera: int) -> Seen:
-        """The frames in which a camera, by its number, saw one of `balls`, and its pixels."""
+    def seen(self, ball: SeenBall, camera: int) -> tuple[Index, Array]:
+        """The frames (m,) in which a camera, by its number, saw one of `balls`, increasing, and its pixels (m, 2)."""
         rows = ball.sightings.camera == camera
         frames = np.searchsorted(self.detections[camera].frames, ball.sightings.times[rows])
-        return Seen(frames.astype(np.int64), ball.sightings.pixels[rows])
+        return frames.astype(np.int64), ball.sightings.pixels[rows]
 
     def rows(self, ball: SeenBall, camera: int) -> Index:
         """(m,) numbers of the candidates of a camera, by its number, that are sightings of one of `balls`."""
-        detections, seen = self.detections[camera], self.seen(ball, camera)
-        first, end = (np.searchsorted(detections.frame, seen.frames, side) for side in ("left", "right"))
+        detections, (frames, pixels) = self.detections[camera], self.seen(ball, camera)
+        first, end = (np.searchsorted(detections.frame, frames, side) for side in ("left", "right"))
         found = [
             low + int(np.argmin(np.abs(detections.pixels[low:high] - pixel).sum(axis=1)))
-            for low, high, pixel in zip(first.tolist(), end.tolist(), seen.pixels, strict=True)
+            for low, high, pixel in zip(first.tolist(), end.tolist(), pixels, strict=True)
         ]
         return np.array(found, dtype=np.int64)
 

@@ -19,7 +19,7 @@ from tests.vision.drawn import Film, Shot
 def run(shots: list[Shot], settings: DetectorSettings | None = None) -> dict[str, np.ndarray]:
     """Errors, NEES, scores of the balls found; best score of anything else; number missed."""
     images = [shot.image for shot in shots]
-    detector = BallDetector.learn(images[:: max(1, len(images) // 15)], settings)
+    detector = BallDetector(images[:: max(1, len(images) // 15)], settings)
     errors, nees, scores, ends, radii, other = [], [], [], [], [], [0.0]
     for shot in shots:
         found = detector(shot.image)
@@ -113,7 +113,7 @@ def test_size_is_marked() -> None:
 
 def test_two_balls_are_two_candidates() -> None:
     shots = list(Film().shots(30, 6.0))
-    detector = BallDetector.learn([shot.image for shot in shots[:15]])
+    detector = BallDetector([shot.image for shot in shots[:15]])
     one, two = detector(shots[20].image), detector(np.maximum(shots[20].image, shots[25].image))
     assert (one.scores > 0.8).sum() == 1
     assert (two.scores > 0.8).sum() == 2
@@ -136,13 +136,11 @@ def test_same_frames_give_the_same_candidates() -> None:
 
 def test_bad_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match="images must be at least three"):
-        BallDetector.learn([])
+        BallDetector([])
     with pytest.raises(ValueError, match="images must have one shape"):
-        BallDetector.learn(
-            [np.zeros((40, 40, 3), np.uint8), np.zeros((40, 44, 3), np.uint8), np.zeros((40, 40), np.uint8)]
-        )
+        BallDetector([np.zeros((40, 40, 3), np.uint8), np.zeros((40, 44, 3), np.uint8), np.zeros((40, 40), np.uint8)])
     with pytest.raises(ValueError, match="image must have the background's shape"):
-        BallDetector.learn([np.full((40, 40, 3), 9, np.uint8)] * 3)(np.zeros((44, 40, 3), np.uint8))
+        BallDetector([np.full((40, 40, 3), 9, np.uint8)] * 3)(np.zeros((44, 40, 3), np.uint8))
     for wrong in ({"diameter": (9.0, 3.0)}, {"longest_streak": -1.0}, {"colour": "blue"}, {"most": 0}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be"):
             DetectorSettings(**wrong)

@@ -189,12 +189,12 @@ def sheet_of(tracking: Tracking, *cameras: int) -> ContactSheet:
 
 def test_a_view_holds_balls_of_several_frames_beside_the_marks() -> None:
     tracking = made()
-    seen = tracking.seen(tracking.balls[0], 0)
-    view = View(seen.frames, seen.pixels, SIZE)
+    frames, pixels = tracking.seen(tracking.balls[0], 0)
+    view = View(frames, pixels, SIZE)
     for number, (_, image) in enumerate(filmed(0)):
         view.see(number, image)
     trail = RIG[0].project(tracking.balls[0].points)
-    picture = view.picture(seen.pixels, [bgr(0)] * len(seen.pixels), trail)
+    picture = view.picture(pixels, [bgr(0)] * len(pixels), trail)
     assert picture.shape[1:] == (WIDTH, 3)
     assert view.last == END - 1
     white = (picture.astype(int).min(axis=2) > 200).astype(np.uint8)

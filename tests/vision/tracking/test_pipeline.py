@@ -93,9 +93,9 @@ def test_the_candidates_of_a_ball_are_found_again(tracking: Tracking) -> None:
     (ball,) = tracking.balls
     for number, detections in enumerate(tracking.detections):
         picked = tracking.rows(ball, number)
-        found = tracking.seen(ball, number)
-        assert np.array_equal(detections.pixels[picked], found.pixels)
-        assert np.array_equal(detections.frame[picked], found.frames)
+        frames, pixels = tracking.seen(ball, number)
+        assert np.array_equal(detections.pixels[picked], pixels)
+        assert np.array_equal(detections.frame[picked], frames)
         assert (detections.scores[picked] > 0.8).all()
 
 
@@ -137,7 +137,7 @@ def test_all_candidates_are_kept_and_the_balls_own_are_named(tracking: Tracking,
     assert all(float(row["sigma_u"]) == pytest.approx(SIGMA) and float(row["rho_uv"]) == 0.0 for row in named)
     middle = [row for row in named if row["camera"] == "middle"]
     pixels = np.array([[float(row["u"]), float(row["v"])] for row in middle])
-    assert np.array_equal(pixels, tracking.seen(tracking.balls[0], 1).pixels)
+    assert np.array_equal(pixels, tracking.seen(tracking.balls[0], 1)[1])
 
 
 def test_no_ball_gives_an_empty_dataset_and_the_best_scores(empty: Tracking, tmp_path: Path) -> None:
