@@ -44,10 +44,8 @@ class TrackScore(Plain):
     """Mean NIS of the observed samples, each against its prediction from the others; 3 is right."""
 
 
-class Summary(BaseModel):
+class Summary(Plain):
     """Prediction errors of a set of tracks."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     tracks: int
     rmse_median: float  # m, median over tracks

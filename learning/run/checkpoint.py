@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -16,6 +16,7 @@ from ballfg.dynamics.coefficient import todays_name
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
+from ballfg.learning.evaluation import Plain
 
 NAME = "checkpoint"
 STATE = "state.yaml"
@@ -23,10 +24,8 @@ DIGESTS = "digests"  # In `state.yaml`: the SHA-256 of every file of tensors
 TENSORS = ("weights", "optimizer", "memory", "best")  # One file `<name>.safetensors` each
 
 
-class RunProgress(BaseModel):
+class RunProgress(Plain):
     """Numbers of finished epochs, of the best epoch, of steps skipped in a row up to now, of tracks; the data."""
-
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     epoch: int
     best_epoch: int

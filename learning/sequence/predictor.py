@@ -4,13 +4,13 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self, get_args
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
 import yaml
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from safetensors.torch import save
 from torch import Tensor
 
@@ -18,6 +18,7 @@ from ballfg.checks import short_text, shown
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import of_one_state, whole_folder
+from ballfg.learning.evaluation import Plain
 from ballfg.learning.sequence.data import Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.diffusion import DiffusionModel
 from ballfg.learning.sequence.model import Frame, LstmModel, SequenceModel
@@ -32,26 +33,10 @@ CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 
 @dataclass(frozen=True)
 class SequenceArchitecture:
-    """Kind and width, of the hidden states or of the denoiser's channels: a multiple of 8, for the attention heads.
-
-    Raises: ValueError: an unknown kind, or a width that is not a positive multiple of 8.
-    """
+    """Kind and width, of the hidden states or of the denoiser's channels: a multiple of 8, for the attention heads."""
 
     kind: SequenceKind
     width: int
-
-    def __post_init__(self) -> None:
-        if self.kind not in _MODELS:
-            raise ValueError(
-                f"kind must be one of {', '.join(get_args(SequenceKind))}; got {shown(self.kind)}. Rename it."
-            )
-        if isinstance(self.width, bool) or not isinstance(self.width, int) or self.width < 8 or self.width % 8:
-            raise ValueError(f"width must be a positive multiple of 8; got {shown(self.width)}. Round it.")
-
-    @classmethod
-    def of(cls, kind: SequenceKind) -> Self:
-        """The default of a kind. Raises: ValueError: an unknown kind."""
-        return cls(kind, DEFAULT_WIDTH.get(kind, 0))
 
     def empty(self, settings: int, points: int) -> SequenceModel:
         """A model before its weights and scales are loaded."""
@@ -68,13 +53,11 @@ class SequenceArchitecture:
         return model
 
 
-class FolderConfig(BaseModel):
+class FolderConfig(Plain):
     """The content of `config.yaml`: architecture, points of the grid, labels of settings, values of textual ones."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
-
     kind: SequenceKind
-    width: Annotated[int, Field(ge=1, le=2048)]
+    width: Annotated[int, Field(ge=8, le=2048, multiple_of=8)]
     points: Annotated[int, Field(ge=1, le=100_000)]
     labels: Annotated[tuple[str, ...], Field(strict=False)]
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
@@ -125,19 +108,8 @@ class SequencePredictor:
             predicted += [row[mask].numpy() for row, mask in rows]
         return predicted
 
-    def save(self, folder: str | Path) -> None:
-        """Write `config.yaml` and `weights.safetensors`; the folder appears once it is whole.
-
-        Raises: ValueError: if the folder exists.
-        """
-        folder = Path(folder)
-        if folder.exists():
-            raise ValueError(f"folder must be new; {folder} exists. Choose another name or delete it.")
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        self.replace(folder)
-
-    def replace(self, folder: Path) -> None:
-        """Write as `save`, in the place of an earlier model of that folder; its parent must exist."""
+    def save(self, folder: Path) -> None:
+        """Write `config.yaml` and `weights.safetensors` in the place of an earlier model; the parent must exist."""
         weights = save({name: value.contiguous() for name, value in self.model.state_dict().items()})
         config = FolderConfig(
             kind=self.architecture.kind,
@@ -161,10 +133,7 @@ class SequencePredictor:
             ValueError: a file is damaged, or weights do not go with the config.
         """
         config, weights = _read(Path(folder))
-        try:
-            architecture = SequenceArchitecture(config.kind, config.width)
-        except ValueError as error:
-            raise ValueError(f"{Path(folder) / CONFIG}: {error}") from None
+        architecture = SequenceArchitecture(config.kind, config.width)
         launcher = LauncherSettings(config.labels, config.categories)
         model = architecture.empty(launcher.size, config.points)
         expected, got = (

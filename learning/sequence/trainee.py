@@ -12,7 +12,7 @@ from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
-from ballfg.learning.sequence.predictor import SequenceArchitecture, SequenceKind, SequencePredictor
+from ballfg.learning.sequence.predictor import DEFAULT_WIDTH, SequenceArchitecture, SequenceKind, SequencePredictor
 from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee, TraineeKind
 from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
@@ -116,7 +116,7 @@ class SequenceTrainee(Trainee):
     def export(self, folder: Path) -> Path:
         """Write the predictor. Returns: its folder, for `SequencePredictor.load`."""
         path = folder / FOLDER
-        self.predictor().replace(path)  # that of a run that was stopped while it ended
+        self.predictor().save(path)  # that of a run that was stopped while it ended
         return path
 
 
@@ -133,6 +133,7 @@ class SequenceModelKind(TraineeKind):
     def build(cls, config: TrainConfig) -> Prepared:
         """The model with its data, ready to train. Raises: ValueError, FileNotFoundError: bad input."""
         data, kept, observed = read_training_data(config), list[Track](), list[int]()
+        kind = cast(SequenceKind, config.kind)
         for shot in data.shots:
             usable, track = shot.usable, shot.track
             sigmas = None if track.sigmas is None else track.sigmas[usable]
@@ -143,7 +144,7 @@ class SequenceModelKind(TraineeKind):
             kept,
             observed,
             data.train,
-            architecture=SequenceArchitecture.of(cast(SequenceKind, config.kind)),
+            architecture=SequenceArchitecture(kind, DEFAULT_WIDTH[kind]),
             launcher=LauncherSettings() if known is None else LauncherSettings(known.labels, known.categories),
             seed=config.seed,
             augment=config.augmented,

@@ -178,7 +178,7 @@ def sequence(seed: int) -> Callable[[Path], None]:
     def work(folder: Path) -> None:
         torch.manual_seed(seed)
         architecture = SequenceArchitecture("lstm", 8)
-        SequencePredictor(architecture, LauncherSettings(), architecture.empty(0, 5)).replace(folder / "model")
+        SequencePredictor(architecture, LauncherSettings(), architecture.empty(0, 5)).save(folder / "model")
 
     return work
 

@@ -77,9 +77,12 @@ def test_without_labels_observations_are_enough(tracks: list[Track]) -> None:
     assert np.isfinite(predictor.predict(bare, 25, bare.times[25:])).all()
 
 
-def test_an_existing_folder_is_not_overwritten(tracks: list[Track], tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"folder must be new; .* exists"):
-        predictor_of("lstm", tracks).save(tmp_path)
+def test_an_earlier_model_is_replaced_and_other_files_stay(tracks: list[Track], tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    for launcher in (LauncherSettings(LABELS), LauncherSettings()):
+        predictor_of("lstm", tracks, launcher).save(tmp_path)
+        assert SequencePredictor.load(tmp_path).launcher == launcher
+    assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 def test_missing_and_damaged_files_are_named(tracks: list[Track], tmp_path: Path) -> None:
@@ -92,9 +95,10 @@ def test_missing_and_damaged_files_are_named(tracks: list[Track], tmp_path: Path
     config, weights = folder / "config.yaml", folder / "weights.safetensors"
     text, tensors = config.read_text(), load_file(weights)
 
-    config.write_text(yaml.safe_dump(yaml.safe_load(text) | {"kind": "gru"}))
-    with pytest.raises(ValueError, match=r"config.yaml: not the config of a sequence model"):
-        SequencePredictor.load(folder)
+    for wrong in ({"kind": "gru"}, {"width": 12}):
+        config.write_text(yaml.safe_dump(yaml.safe_load(text) | wrong))
+        with pytest.raises(ValueError, match=r"config.yaml: not the config of a sequence model"):
+            SequencePredictor.load(folder)
     config.write_text(yaml.safe_dump(yaml.safe_load(text) | {"width": 24}))
     with pytest.raises(ValueError, match=r"weights in .* must be those of the model in its config; 'bridge.bias' is"):
         SequencePredictor.load(folder)
@@ -111,9 +115,3 @@ def test_missing_and_damaged_files_are_named(tracks: list[Track], tmp_path: Path
     weights.write_bytes(b"not numbers")
     with pytest.raises(ValueError, match=r"weights.safetensors must be a whole safetensors file"):
         SequencePredictor.load(folder)
-
-
-@pytest.mark.parametrize(("kind", "width", "message"), [("gru", 16, "kind must be one of"), ("lstm", 12, "width must")])
-def test_an_architecture_checks_itself(kind: SequenceKind, width: int, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        SequenceArchitecture(kind, width)
