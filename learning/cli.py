@@ -6,7 +6,7 @@ Heavy libraries are imported inside functions: `ballfg-train --help` must not wa
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,24 +18,8 @@ from ballfg.progress import alive, announce, idle, progress
 if TYPE_CHECKING:
     from ballfg.learning.config.training import TrainConfig
 
+OwnFiles = tuple[list[Path], list[Path]]  # Those that define effects of one's own, and observations
 app = typer.Typer(name="ballfg-train", add_completion=False, pretty_exceptions_enable=False)
-
-
-class OwnFiles(NamedTuple):
-    """Files that define effects and observations of one's own."""
-
-    effects: list[Path]
-    observations: list[Path]
-
-    def know(self) -> None:
-        """Registers them in this process."""
-        inputs.know_effects(self.effects)
-        inputs.know_observations(self.observations)
-
-    def typed(self) -> list[str]:
-        """The options that name them."""
-        pairs = (("--effects-file", self.effects), ("--observations-file", self.observations))
-        return [word for option, files in pairs for file in files for word in (option, str(file))]
 
 
 @app.command()
@@ -75,8 +59,8 @@ def train(
     settings = read_config(config, overrides or (), {key: value for key, value in options.items() if value})
     if not settings.data:
         raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
-    folder, own = Path(settings.out), OwnFiles(effects_file or [], observations_file or [])
-    own.know()
+    folder, own = Path(settings.out), (effects_file or [], observations_file or [])
+    _know(*own)
     if isinstance(settings, CalibrationConfig):
         if isinstance(settings.data, str):
             from ballfg.learning.calibration.run import run_calibration as calibrate
@@ -84,17 +68,19 @@ def train(
             from ballfg.learning.calibration.sets import calibrate_sets as calibrate
         status = calibrate(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
-        typed = shlex.join([*_typed(config, overrides or (), data or (), out, resume), *own.typed()])
+        given: dict[str, Any] = {"--data": data, "--out": out and [out], "--resume": resume and [resume]}
+        given |= dict(zip(("--effects-file", "--observations-file"), own, strict=True))
+        words = [word for option, values in given.items() for value in values or () for word in (option, str(value))]
+        typed = shlex.join(["ballfg-train", str(config), *(overrides or ()), *words])
         status = _train(settings, folder, resume is not None, typed, own)
     if status:
         raise SystemExit(status)
 
 
-def _typed(
-    config: Path, overrides: Sequence[str], data: Sequence[str], out: str | None, resume: str | None
-) -> list[str]:
-    words = ["ballfg-train", str(config), *overrides, *(word for folder in data for word in ("--data", folder))]
-    return words + [word for option, one in (("--out", out), ("--resume", resume)) if one for word in (option, one)]
+def _know(effects: list[Path], observations: list[Path]) -> None:
+    """Registers effects and observations of one's own in this process."""
+    inputs.know_effects(effects)
+    inputs.know_observations(observations)
 
 
 def _train(config: "TrainConfig", folder: Path, resume: bool, typed: str, own: OwnFiles) -> int:
@@ -127,7 +113,7 @@ def _train_guarded(config: "TrainConfig", folder: Path, resume: bool, typed: str
     def work() -> int:
         try:
             with alive("ballfg-train"):
-                own.know()
+                _know(*own)
                 return _train_here(config, folder, resume, typed)
         except KeyboardInterrupt:  # this command says so
             return NO_STATUS

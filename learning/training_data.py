@@ -1,33 +1,62 @@
-"""Reads the data of a training from a config: datasets, split, shots, and the settings of the estimator."""
+"""Reads the data of a training from a config: datasets, split, tracks cut into shots, settings of the estimator."""
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ballfg.checks import shown
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model
+from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.nominal import inertia_factor
-from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, read_sighted
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces, read_sighted
 from ballfg.estimation.configure import table_note
 from ballfg.estimation.flights.dataset import in_flight
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.reading import has_positions, with_readings
+from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.shots import TrainingShot, shots_of
 from ballfg.learning.split import training_split
 from ballfg.progress import print_doubts, print_notes
 from ballfg.tracks import Ball, Dataset, Track, read_dataset
 
+LEAST_OBSERVED = 5  # Samples that an estimate needs
+LEAST_PREDICTED = 3  # Samples that a prediction is judged on
 D = TypeVar("D", Dataset, SightedDataset)
 FIRST_SPIN = {"topspin": (0.0, 50.0, 0.0), "sidespin": (0.0, 0.0, 50.0)}
 """rad/s about (forward, across, up) per level of the settings with a known axis; other settings start at no spin."""
 FIRST_SPIN_NOISE = 60.0  # rad/s, standard deviation of the spin given the settings, before anything is learned
+
+
+@dataclass(frozen=True)
+class TrainingShot:
+    """One track, cut into an observed part and a part to predict."""
+
+    track: Track  # the undisturbed part of the flight, up to the first hit
+    observed: int  # number of samples that the estimate sees; they come first
+    usable: NDArray[np.bool_]  # (n,) bool, samples that measure the ball
+    segmentation: Segmentation  # events of the observed part
+    settings: Settings  # of the estimator, before anything is learned
+    surfaces: Surfaces
+    room: str = ""  # name of the dataset
+
+    @property
+    def name(self) -> str:
+        """The track's name."""
+        return self.track.name
+
+    @property
+    def seen(self) -> Track:
+        """The observed part."""
+        return part(self.track, self.observed)
 
 
 @dataclass(frozen=True)
@@ -202,3 +231,39 @@ def _shots(
                 shots.append(replace(shot, room=dataset.info.name))
     print_notes(f"{count} tracks of {reason}" for reason, count in reasons.items())
     return shots, kept
+
+
+def part(track: Track, count: int) -> Track:
+    """The first samples of a track."""
+    return track.until(float(track.times[count - 1]))
+
+
+def shots_of(
+    tracks: Iterable[Track],
+    model: BallModel,
+    surfaces: Surfaces,
+    settings: Settings,
+    *,
+    samples: int | None,
+    seconds: float | None,
+) -> Iterator[tuple[Track, TrainingShot | str]]:
+    """Each track with its shot, or the reason why it gives none. Observed are so many samples, or seconds.
+
+    The model finds the events; an analytic one will do.
+    """
+    smoother = Smoother(model, surfaces, settings)
+    for given in tracks:
+        track = given.since_first()
+        whole = smoother.segment(track)
+        end = int(whole.hits[0]) + 1 if len(whole.hits) else len(track)
+        track, usable = part(track, end), whole.usable[:end]
+        observed = samples if seconds is None else len(track.opening(seconds))
+        assert observed is not None
+        if observed < LEAST_OBSERVED or usable[:observed].sum() < LEAST_OBSERVED:
+            yield given, f"fewer than {LEAST_OBSERVED} usable samples are observed"
+        elif usable[observed:].sum() < LEAST_PREDICTED:
+            least = f"fewer than {LEAST_PREDICTED} usable samples"
+            yield given, f"{least} follow the observed part before the ball is hit"
+        else:
+            events = smoother.segment(part(track, observed))
+            yield given, TrainingShot(track, observed, usable, events, smoother.settings, smoother.surfaces)

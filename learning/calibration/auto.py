@@ -20,8 +20,7 @@ from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.calibration import calibrate
 from ballfg.learning.calibration.groups import OWN, Groups
-from ballfg.learning.calibration.judging import judged
-from ballfg.learning.calibration.problem import Linear, Problem, Step, population_model, population_settings
+from ballfg.learning.calibration.problem import Linear, Problem, Step, judged, population_model, population_settings
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Plain, TrackScore, summary
 from ballfg.progress import Watch, unwatched

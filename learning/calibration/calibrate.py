@@ -30,7 +30,6 @@ from ballfg.factors.loss import Loss
 from ballfg.learning.calibration.coefficients import Chosen, with_values
 from ballfg.learning.calibration.correction import Correction, doubt_sigmas, with_correction, with_weights
 from ballfg.learning.calibration.groups import GroupSpin
-from ballfg.learning.calibration.judging import score
 from ballfg.learning.calibration.population import Evidence, agreeing, evidence, fit_population
 from ballfg.learning.calibration.problem import (
     Linear,
@@ -40,6 +39,7 @@ from ballfg.learning.calibration.problem import (
     plain,
     population_model,
     population_settings,
+    score,
 )
 from ballfg.learning.calibration.volume import estimate_with_slopes
 from ballfg.learning.config.calibration import CalibrationConfig

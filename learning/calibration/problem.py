@@ -1,7 +1,9 @@
-"""Holds what a calibration is given, its steps in plain numbers, and the model and settings that a step makes."""
+"""Holds what a calibration is given, its steps in plain numbers, the model and settings of a step, and judges them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from typing import Self
 
 import numpy as np
@@ -10,18 +12,21 @@ from pydantic import Field
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
+from ballfg.estimation import Estimator, Settings, dataset_settings, dataset_surfaces
+from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
+from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import ONE_VIEW, USUAL, Chosen, choose, with_values
 from ballfg.learning.calibration.correction import Correction, doubt_sigmas, set_doubts
 from ballfg.learning.calibration.groups import Groups, GroupSpin
 from ballfg.learning.calibration.population import Evidence
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
-from ballfg.learning.evaluation import Plain, TrackScore
-from ballfg.learning.split import Split, split_tracks
-from ballfg.tracks import Dataset
+from ballfg.learning.evaluation import Plain, TrackScore, judge_track
+from ballfg.learning.split import Split, split_tracks, tracks_of
+from ballfg.progress import Watch, unwatched
+from ballfg.tracks import Dataset, Track
 from ballfg.tracks.noise import TrackNoise
 
 
@@ -132,3 +137,38 @@ def population_model(problem: Problem, step: Step) -> AnalyticModel:
 def plain(values: Array) -> tuple[float, ...]:
     """Numbers (n,) as a step keeps them."""
     return tuple(values.tolist())
+
+
+def score(
+    problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
+) -> tuple[TrackScore | None, ...]:
+    """Scores of the judging tracks, in order, by a model with its settings."""
+    config = problem.config
+    horizon = np.inf if config.horizon is None else config.horizon
+    return judged(problem, [(model, settings)], problem.split.judge, (config.observed_share,), horizon, watch)
+
+
+def judged(
+    problem: Problem,
+    made: Sequence[tuple[AnalyticModel, Settings]],
+    names: tuple[str, ...],
+    shares: Sequence[float],
+    horizon: float,
+    watch: Watch,
+) -> tuple[TrackScore | None, ...]:
+    """Scores of the forecasts of some tracks from some shares of each, track after track.
+
+    Args: made: model and settings of each fold of the tracks; one of all tracks is the fold of all.
+    """
+    smoothers = [make_estimator("smoother", model, problem.surfaces, settings) for model, settings in made]
+    of_track = {name: smoothers[k % len(smoothers)] for k, name in enumerate(names)}
+    forecasts, tracks = partial(_forecasts, of_track, shares, horizon), tracks_of(problem.dataset, names)
+    scores = map_tracks(forecasts, tracks, len(names), problem.jobs)
+    return tuple(chain.from_iterable(watch(scores, len(names), "tracks judged")))
+
+
+def _forecasts(
+    smoothers: Mapping[str, Estimator], shares: Sequence[float], horizon: float, track: Track
+) -> list[TrackScore | None]:
+    """Scores of one track's forecasts from each share of it, by its own smoother."""
+    return [judge_track(smoothers[track.name], track, share, horizon) for share in shares]

@@ -10,9 +10,8 @@ from ballfg.checks import aligned
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration.calibrate import has_converged
 from ballfg.learning.calibration.correction import SCALE, learned, places
-from ballfg.learning.calibration.gain import Gain, gain_of
 from ballfg.learning.calibration.problem import Problem, Step, population_model
-from ballfg.learning.evaluation import Summary, TrackScore, summary
+from ballfg.learning.evaluation import Gain, Summary, TrackScore, gain_of, summary
 
 AXES = ("forward", "across", "up")
 NEW_INFORMATION = 0.05  # Least share by which informative data narrow the prior of a coefficient

@@ -34,14 +34,12 @@ from ballfg.learning.calibration.calibrate import (
     with_scores,
     with_shown_noise,
 )
-from ballfg.learning.calibration.gain import denser
-from ballfg.learning.calibration.judging import score
 from ballfg.learning.calibration.picture import draw
-from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose
+from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose, score
 from ballfg.learning.calibration.report import compare, outcome, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
-from ballfg.learning.evaluation import Plain, TrackScore, summary
+from ballfg.learning.evaluation import Plain, TrackScore, denser, summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.record import NOT_BETTER
 from ballfg.learning.start import describe

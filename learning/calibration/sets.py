@@ -22,14 +22,12 @@ from ballfg.estimation import Settings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.learning.calibration.calibrate import fitted_noise, with_shown_noise
 from ballfg.learning.calibration.coefficients import Chosen, with_values
-from ballfg.learning.calibration.gain import Gain, denser, gain_of
 from ballfg.learning.calibration.groups import OWN
-from ballfg.learning.calibration.judging import score
 from ballfg.learning.calibration.population import Population, evidence, fit_population
-from ballfg.learning.calibration.problem import Problem, Step, pose
+from ballfg.learning.calibration.problem import Problem, Step, pose, score
 from ballfg.learning.calibration.run import read_checkpoint, status_of, take_steps
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import TrackScore, summary
+from ballfg.learning.evaluation import Gain, TrackScore, denser, gain_of, summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.training_data import analytic_model, check_apart, open_source
 from ballfg.progress import Watch

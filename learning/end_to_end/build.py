@@ -21,9 +21,8 @@ from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.pretrain import Anchor, pretrain
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradient, UnrolledGradient
-from ballfg.learning.shots import TrainingShot
 from ballfg.learning.trainee import NETWORKS, Prepared, TraineeKind
-from ballfg.learning.training_data import read_training_data
+from ballfg.learning.training_data import TrainingShot, read_training_data
 from ballfg.progress import doing
 from ballfg.state import SPIN, VELOCITY
 

@@ -19,7 +19,7 @@ from ballfg.estimation import Smoother, estimate_noise, predict_tracks
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.end_to_end.solving import Solved
-from ballfg.learning.shots import TrainingShot
+from ballfg.learning.training_data import TrainingShot
 from ballfg.state import STATE_DIM
 from ballfg.tracks.noise import TrackNoise
 

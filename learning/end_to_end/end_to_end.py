@@ -32,8 +32,8 @@ from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, Gau
 from ballfg.learning.gradient.implicit import GradientMethod, ImplicitGradient, LinearSolver
 from ballfg.learning.gradient.objective import BatchObjective, negative_log_likelihood
 from ballfg.learning.run.run_folder import MODEL
-from ballfg.learning.shots import TrainingShot
 from ballfg.learning.trainee import BatchLoss, Learned, PredictedShot, Trainee
+from ballfg.learning.training_data import TrainingShot
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.noise import TrackNoise
 

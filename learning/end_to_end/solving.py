@@ -17,7 +17,7 @@ from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.learning.augment import apply, rotate, undo
 from ballfg.learning.end_to_end.learnables import Learnables
-from ballfg.learning.shots import TrainingShot
+from ballfg.learning.training_data import TrainingShot
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import Track
 from ballfg.tracks.track import SPIN_LABELS

@@ -15,9 +15,8 @@ from torch import Tensor, nn
 
 from ballfg.checks import listed
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
-from ballfg.learning.run.checkpoint import Checkpoint, RunProgress
 from ballfg.learning.run.ranks import Ranks, SharedMemory
-from ballfg.learning.run.run_folder import Epoch, data_digest
+from ballfg.learning.run.run_folder import Checkpoint, Epoch, RunProgress, data_digest
 from ballfg.learning.trainee import BatchLoss, Trainee
 from ballfg.progress import Watch
 

@@ -18,9 +18,8 @@ from ballfg.dynamics import load_model, save_model
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.files.whole_file import whole_file, write_text
 from ballfg.learning.run import run_folder as files
-from ballfg.learning.run.checkpoint import Checkpoint, write_checkpoint
 from ballfg.learning.run.loop import Training
-from ballfg.learning.run.run_folder import Epoch, epoch_line, read_metrics, write_metrics
+from ballfg.learning.run.run_folder import Checkpoint, Epoch, epoch_line, read_metrics, write_checkpoint, write_metrics
 from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
 from ballfg.learning.start import NETWORK, Start
 from ballfg.learning.trainee import PredictedShot

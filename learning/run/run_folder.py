@@ -1,21 +1,31 @@
-"""Checks and prepares the folder of a run: names of its files, config, versions; an epoch, a row of `metrics.csv`."""
+"""Checks, prepares and writes the folder of a run: config, versions, rows of `metrics.csv`, checkpoints.
+
+The checkpoint of a training is a folder of tensors and YAML, for an exact continuation.
+"""
 
 import csv
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import yaml
+from pydantic import ValidationError
+from safetensors.torch import save
+from torch import Tensor
 
 from ballfg.checks import one_line, short_text, shown
+from ballfg.dynamics.coefficient import todays_name
+from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.weights import read_tensors
 from ballfg.files.whole_file import write_text
-from ballfg.files.whole_folder import reserved
+from ballfg.files.whole_folder import reserved, whole_folder
 from ballfg.learning.config.config_file import Config, read_config
+from ballfg.learning.evaluation import Plain
 from ballfg.machine import versions
 from ballfg.tracks.info import INFO_FILE
 
@@ -27,6 +37,9 @@ PAGE = "training.html"
 CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)  # Files of a calibration
 TRAINING = (CONFIG, VERSIONS, MODEL, CHECKPOINT, METRICS, CURVES, EVENTS, PAGE)
 """Files and folders of a training; a learned model adds a folder of its own."""
+STATE = "state.yaml"  # Of a checkpoint
+DIGESTS = "digests"  # In `state.yaml`: the SHA-256 of every file of tensors
+TENSORS = ("weights", "optimizer", "memory", "best")  # One file `<name>.safetensors` each
 TABLES = ("tracks", "labels")  # Of a dataset
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "safetensors")
 
@@ -142,7 +155,7 @@ class Epoch:
 def write_metrics(path: Path, epochs: Sequence[Epoch]) -> None:
     """Write the table; an empty cell stands for None. Floats are read back bit for bit."""
     text = io.StringIO()
-    table = csv.DictWriter(text, [field.name for field in fields(Epoch)], lineterminator="\n")
+    table = csv.DictWriter(text, [column.name for column in fields(Epoch)], lineterminator="\n")
     table.writeheader()
     for epoch in epochs:
         table.writerow(asdict(epoch))
@@ -187,3 +200,77 @@ def _duration(seconds: float) -> str:
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+
+
+class RunProgress(Plain):
+    """Numbers of finished epochs, of the best epoch, of steps skipped in a row up to now, of tracks; the data."""
+
+    epoch: int
+    best_epoch: int
+    best_rmse: float | None  # m, RMSE of the best weights on the validation tracks; null: none was judged
+    skipped_in_row: int
+    train: int
+    validation: int
+    data: str | None = None  # Digest of the datasets' files (`data_digest`); None: earlier versions did not keep it
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A run after an epoch: the module now and at the best epoch, its optimizer (`moments`), memory of the trainee.
+
+    There is no random state: random numbers derive from seed, epoch and track.
+    """
+
+    progress: RunProgress
+    weights: dict[str, Tensor]
+    best: dict[str, Tensor]
+    optimizer: dict[str, Tensor] = field(default_factory=dict)
+    memory: dict[str, Tensor] = field(default_factory=dict)
+
+    def renamed(self, known: Container[str]) -> Self:
+        """This checkpoint with tensors under the names of today; known: those of the module."""
+
+        def today(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            split = ((name.partition("/"), tensor) for name, tensor in tensors.items())
+            return {todays_name(name, known) + slash + moment: tensor for (name, slash, moment), tensor in split}
+
+        return replace(self, weights=today(self.weights), best=today(self.best), optimizer=today(self.optimizer))
+
+
+def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
+    """Replace the checkpoint in the folder of a run. At every moment the old or the new one exists as a whole."""
+    with whole_folder(folder / CHECKPOINT, earlier=("*",)) as part:
+        for name in TENSORS:
+            tensors: dict[str, Tensor] = getattr(checkpoint, name)
+            owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
+            (part / f"{name}.safetensors").write_bytes(save(owned))
+        state = checkpoint.progress.model_dump() | {DIGESTS: _digests(part)}
+        (part / STATE).write_text(yaml.safe_dump(state, sort_keys=False), encoding="utf-8")
+
+
+def read_checkpoint(folder: Path) -> Checkpoint | None:
+    """The checkpoint of a run that goes on; None if it stopped before the first.
+
+    Raises: ValueError: if it is damaged.
+    """
+    path = folder / CHECKPOINT
+    if not path.exists():
+        return None
+    try:
+        content: Any = read_yaml(path / STATE)
+        digests = content.pop(DIGESTS, None) if isinstance(content, dict) else None
+        tensors = {name: read_tensors(path / f"{name}.safetensors") for name in TENSORS}
+        progress = RunProgress.model_validate(content)
+        if digests is not None and digests != _digests(path):  # checkpoints of earlier versions have none
+            raise ValueError(f"the tensors are not those that {STATE} states: a file is damaged")
+        return Checkpoint(progress, **tensors)
+    except ValidationError as error:
+        reason = f"{STATE}: {error.errors()[0]['msg']}"
+    except (OSError, ValueError) as error:
+        reason = one_line(error)
+    raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    files = {name: folder / f"{name}.safetensors" for name in TENSORS}
+    return {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run import run_folder as files
-from ballfg.learning.run.checkpoint import Checkpoint, read_checkpoint
 from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
 from ballfg.learning.run.ranks import TOLD_BY_FIRST, Ranks, join_ranks
+from ballfg.learning.run.run_folder import Checkpoint, read_checkpoint
 from ballfg.learning.start import Start, calibrated_start
 from ballfg.learning.trainee import TRAINEES, Prepared
 from ballfg.progress import Watch, unwatched

@@ -10,7 +10,7 @@ from ballfg.dynamics import Architecture, build, nominal_model
 from ballfg.dynamics.coefficient import todays_name
 from ballfg.estimation import ExtendedKalmanFilter, Settings, Smoother
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.run.checkpoint import Checkpoint, RunProgress
+from ballfg.learning.run.run_folder import Checkpoint, RunProgress
 from ballfg.tracks import Track
 from tests.small_networks import SMALL
 

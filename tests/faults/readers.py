@@ -20,8 +20,7 @@ from ballfg.importing.proposal import propose
 from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import read_checkpoint as read_steps
 from ballfg.learning.config.config_file import read_config
-from ballfg.learning.run.checkpoint import read_checkpoint
-from ballfg.learning.run.run_folder import read_metrics
+from ballfg.learning.run.run_folder import read_checkpoint, read_metrics
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.live.sources.sender import Sender
 from ballfg.pages.given import recognise

@@ -18,7 +18,7 @@ from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
-from ballfg.learning.run.checkpoint import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
+from ballfg.learning.run.run_folder import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
 from ballfg.learning.run.training import run_training
 from ballfg.learning.sequence.data import LauncherSettings
 from ballfg.learning.sequence.predictor import SequenceArchitecture, SequencePredictor

@@ -24,8 +24,7 @@ from ballfg.learning.calibration.problem import Problem, Step, TrackFit, pose
 from ballfg.learning.calibration.run import write_checkpoint as write_steps
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore
-from ballfg.learning.run.checkpoint import write_checkpoint
-from ballfg.learning.run.run_folder import Epoch, write_metrics
+from ballfg.learning.run.run_folder import Epoch, write_checkpoint, write_metrics
 from ballfg.simulation import SimulationConfig
 from ballfg.simulation.writing import write_simulation
 from ballfg.tracks import read_dataset

@@ -27,7 +27,7 @@ from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors
 from ballfg.learning.gradient.implicit import GradientMethod
 from ballfg.learning.gradient.objective import BatchObjective
-from ballfg.learning.shots import TrainingShot, shots_of
+from ballfg.learning.training_data import TrainingShot, shots_of
 from ballfg.tracks import Track
 
 TABLE = Surfaces(0.0)

@@ -14,7 +14,7 @@ from ballfg.estimation import Settings, Smoother
 from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
 from ballfg.learning.augment import SHIFT, apply, augmentation, rotate, undo
-from ballfg.learning.shots import TrainingShot, part, shots_of
+from ballfg.learning.training_data import TrainingShot, part, shots_of
 from ballfg.tracks import Track
 
 TABLE = Surfaces(0.0, -0.76)

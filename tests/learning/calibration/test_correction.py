@@ -42,10 +42,9 @@ from ballfg.learning.calibration.correction import (
     with_correction,
 )
 from ballfg.learning.calibration.groups import WIDTHS, _widest
-from ballfg.learning.calibration.judging import score
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.population import Evidence
-from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose
+from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose, score
 from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import run_calibration
 from ballfg.learning.config.calibration import CalibrationConfig

@@ -20,8 +20,7 @@ from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.auto import CALIBRATED, GROUPED
 from ballfg.learning.calibration.calibrate import calibrate, has_converged
 from ballfg.learning.calibration.coefficients import with_values
-from ballfg.learning.calibration.judging import score
-from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose
+from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose, score
 from ballfg.learning.calibration.run import run_calibration
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import summary

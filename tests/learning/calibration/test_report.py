@@ -10,12 +10,11 @@ import pytest
 from scipy import stats
 
 from ballfg.dynamics import nominal_model
-from ballfg.learning.calibration.gain import denser, gain_of
 from ballfg.learning.calibration.problem import Problem, Step, pose
 from ballfg.learning.calibration.report import Comparison, outcome, report, table, verdict
 from ballfg.learning.calibration.run import status_of
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import Summary
+from ballfg.learning.evaluation import Summary, denser, gain_of
 from ballfg.tracks import read_dataset
 
 NONE = Comparison(None, None, None, None, 0, np.zeros((0, 2)), 3)

@@ -18,7 +18,7 @@ from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.solving import Pose
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradient
-from ballfg.learning.shots import TrainingShot
+from ballfg.learning.training_data import TrainingShot
 from tests.learning.end_to_end.gradients import gradient, network
 from tests.learning.estimates import (
     NOISE,

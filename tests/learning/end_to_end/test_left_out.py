@@ -15,7 +15,7 @@ from ballfg.learning.end_to_end import end_to_end
 from ballfg.learning.end_to_end.end_to_end import SOLUTION_TOLERANCE, EndToEnd
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, NotAMinimum
-from ballfg.learning.shots import part
+from ballfg.learning.training_data import part
 from tests.learning.end_to_end.gradients import gradient
 from tests.learning.estimates import NOISE, OBSERVED, SETTINGS, launcher, measured, shots, trainee, usual_ball
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from ballfg.files import whole_folder
-from ballfg.learning.run.checkpoint import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
-from ballfg.learning.run.run_folder import read_metrics
+from ballfg.learning.run.run_folder import Checkpoint, RunProgress, read_checkpoint, read_metrics, write_checkpoint
 
 
 def made(epoch: int) -> Checkpoint:

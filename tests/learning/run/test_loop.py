@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
-from ballfg.learning.run.checkpoint import Checkpoint
 from ballfg.learning.run.loop import Task, Training, TrainingStoppedError, rate_factor
 from ballfg.learning.run.ranks import Ranks
-from ballfg.learning.run.run_folder import Epoch
+from ballfg.learning.run.run_folder import Checkpoint, Epoch
 from tests.learning.run.falling_ball import NOISE, TRUE_DRAG, TRUE_GRAVITY, FallingBalls
 
 

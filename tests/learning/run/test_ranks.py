@@ -19,9 +19,8 @@ from ballfg.learning.cli import run
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run import ranks as launching
-from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.ranks import Ranks, SharedMemory, for_others, join_ranks, launch
-from ballfg.learning.run.run_folder import read_metrics
+from ballfg.learning.run.run_folder import read_checkpoint, read_metrics
 from ballfg.learning.run.training import run_training
 from ballfg.progress import progress
 from tests.faults.kills import in_fork

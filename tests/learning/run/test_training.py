@@ -16,8 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
 from ballfg.learning.run import record, run_folder as files, training
-from ballfg.learning.run.checkpoint import read_checkpoint
-from ballfg.learning.run.run_folder import Epoch, epoch_line, read_metrics, write_metrics
+from ballfg.learning.run.run_folder import Epoch, epoch_line, read_checkpoint, read_metrics, write_metrics
 from ballfg.simulation import SimulationConfig, write_simulation
 
 
