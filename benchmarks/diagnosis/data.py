@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, STATED_NOISE, Case
+from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, PLANTS, STATED_NOISE, Case
 from ballfg.benchmarks.diagnosis.changes import CHANGES
-from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.diagnosis.fit.fit import first_guess, fit_problem, reachable
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import hold_out

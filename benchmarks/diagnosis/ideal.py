@@ -19,9 +19,8 @@ from numpy.typing import ArrayLike
 from scipy import optimize, special, stats
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
+from ballfg.benchmarks.diagnosis.cases import PLANTS, Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
-from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
 from ballfg.benchmarks.results import Kept
 from ballfg.diagnosis.fit.fit import fit_model

@@ -20,7 +20,7 @@ from ballfg.benchmarks.diagnosis.record import Found, Record, is_one_of
 from ballfg.benchmarks.diagnosis.suite import collect_records, run_case
 from ballfg.benchmarks.metrics import Figure, share
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, save
-from ballfg.benchmarks.results import RUNS_FOLDER, Results
+from ballfg.benchmarks.results import Results
 from ballfg.diagnosis.residual_tests.tracker_errors import UNITS
 from ballfg.dynamics import EFFECTS, Coefficient
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY
@@ -150,10 +150,8 @@ def run_planted(
     Args: chosen: names of changes.  most: number of tracks of each set; None for all.
     Returns: the picture written.
     """
-    runs = out / RUNS_FOLDER
-    runs.mkdir(exist_ok=True)
     cases = {name: list(planted_cases(name, f, results.seed, chosen, most)) for name, f in by_name(folders).items()}
-    records = collect_records([case for own in cases.values() for case in own], runs, jobs, run)
+    records = collect_records([case for own in cases.values() for case in own], out, jobs, run)
     outcomes = {
         (name, case.change): outcome_of(case.change, records.get(own[0].name), records.get(case.name))
         for name, own in cases.items()

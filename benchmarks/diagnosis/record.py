@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 
-from ballfg.benchmarks.diagnosis.cases import Case, Recording
-from ballfg.benchmarks.diagnosis.effects import PLANTS
+from ballfg.benchmarks.diagnosis.cases import PLANTS, Case, Recording
 from ballfg.benchmarks.results import Kept
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Outcome, Value, Verdict

@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from ballfg.benchmarks.diagnosis.cases import BARE, STATED_NOISE, Case
-from ballfg.benchmarks.diagnosis.effects import PLANTS
+from ballfg.benchmarks.diagnosis.cases import BARE, PLANTS, STATED_NOISE, Case
 from ballfg.benchmarks.diagnosis.ideal import Curve, Ideal, power_curve
 from ballfg.benchmarks.diagnosis.record import Record, alarmed, complete, false_names, named, right
 from ballfg.benchmarks.metrics import median_and_range, share

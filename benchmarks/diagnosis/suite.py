@@ -12,9 +12,8 @@ from typing import TypeVar
 import numpy as np
 from scipy.stats import binom
 
-from ballfg.benchmarks.diagnosis.cases import Case, Plan, Recording, all_cases, timed_cases
+from ballfg.benchmarks.diagnosis.cases import PLANTS, Case, Plan, Recording, all_cases, timed_cases
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset, measured_dataset, true_errors
-from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of
 from ballfg.benchmarks.diagnosis.record import Record, case_digest, record_of
 from ballfg.benchmarks.diagnosis.rows import add_all, detectable
@@ -45,9 +44,9 @@ def run_case(case: Case, diagnose: Callable[..., Diagnosis] = diagnose) -> Recor
 
 
 def collect_records(
-    cases: Sequence[Case], folder: Path, jobs: int, run: Callable[[Case], Record] = run_case
+    cases: Sequence[Case], out: Path, jobs: int, run: Callable[[Case], Record] = run_case
 ) -> dict[str, Record]:
-    """The records of cases by their names: read from an existing folder where they are there, else made and kept.
+    """The records of cases by their names: read from `out`, an existing folder, where they are, else made and kept.
 
     A case whose diagnosis raises has no record: stderr reports it, it counts as failed, and the next run repeats it.
     """
@@ -59,23 +58,25 @@ def collect_records(
             print(f"{case.name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
             return None
 
-    found = _collect(Record, {case.name: case for case in cases}, tried, folder, jobs, "diagnoses finished")
+    found = _collect(Record, {case.name: case for case in cases}, tried, out, jobs, "diagnoses finished")
     return {name: record for name, record in found.items() if record is not None}
 
 
 def collect_ideals(
-    names: Iterable[str], seed: int, folder: Path, jobs: int, compute: Callable[[Case], Ideal] = ideal_of
+    names: Iterable[str], seed: int, out: Path, jobs: int, compute: Callable[[Case], Ideal] = ideal_of
 ) -> dict[str, Ideal]:
     """The ideal tests of effects by name: read where they are there, else computed and kept."""
     cases = {f"ideal-{name}": ideal_case(name, seed) for name in names}
-    found = _collect(Ideal, cases, compute, folder, jobs, "ideal tests finished")
+    found = _collect(Ideal, cases, compute, out, jobs, "ideal tests finished")
     return {cases[name].subject: ideal for name, ideal in found.items() if ideal is not None}
 
 
 def _collect(
-    kind: type[K], cases: Mapping[str, Case], make: Callable[[Case], K | None], folder: Path, jobs: int, what: str
+    kind: type[K], cases: Mapping[str, Case], make: Callable[[Case], K | None], out: Path, jobs: int, what: str
 ) -> dict[str, K | None]:
     """Kept parts by the names of their files without the ending."""
+    folder = out / RUNS_FOLDER
+    folder.mkdir(exist_ok=True)
 
     def finish(name: str) -> K | None:
         made = make(cases[name])
@@ -105,15 +106,13 @@ def run_loop(
     """
     from ballfg.benchmarks.diagnosis.pictures import confusion_picture, power_picture, repair_picture
 
-    folder = out / RUNS_FOLDER
-    folder.mkdir(exist_ok=True)
     if not data:
         print("note: no --data: nothing measured is diagnosed", file=sys.stderr)
-    ideals = collect_ideals([n for n in plan.effects if PLANTS[n].sized], results.seed, folder, jobs, ideal)
+    ideals = collect_ideals([n for n in plan.effects if PLANTS[n].sized], results.seed, out, jobs, ideal)
     cases = all_cases(plan, results.seed, detectable(ideals), data)
-    records = collect_records(cases, folder, jobs, run)
+    records = collect_records(cases, out, jobs, run)
     timed = list(timed_cases(plan, results.seed))
-    records |= collect_records(timed, folder, 1, run)  # alone, one after the other
+    records |= collect_records(timed, out, 1, run)  # alone, one after the other
     add_all(results, [*cases, *timed], records, ideals)
     return [
         power_picture(cases, records, ideals, out / "loop_power.png"),
@@ -148,10 +147,8 @@ def run_reliability(
     results: Results, out: Path, count: int, jobs: int, run: Callable[[Case], Record] = run_case
 ) -> None:
     """Simulate, diagnose, and add the rows; finished sets are kept in `out`, an existing folder."""
-    runs = out / RUNS_FOLDER
-    runs.mkdir(exist_ok=True)
     cases = list(reliability_cases(count, results.seed))
-    add_reliability(results, cases, collect_records(cases, runs, jobs, run))
+    add_reliability(results, cases, collect_records(cases, out, jobs, run))
 
 
 def _right(case: Case) -> set[str]:

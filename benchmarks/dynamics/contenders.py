@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import torch
@@ -46,28 +46,6 @@ class Job:
         return self.tasks[0].truth is None
 
 
-class Contender(Protocol):
-    """A trained method, or one that needs no training.
-
-    Attributes:
-        name: the method in `results.json`.  parameter_count: numbers that were learned, 0 for none.
-        training_seconds: s, wall clock; 0 where nothing was learned.
-    """
-
-    name: str
-    parameter_count: int
-    training_seconds: float
-
-    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
-        """Positions at all stamps of some tracks, from their observed parts.
-
-        Args:
-            seen: the observed samples with their labels: nothing later is in reach.
-            times: (n,) s for each track, the stamps of the whole track; the first ones are those of the observed part.
-        Returns: (n, 3) m for each track; NaN at observed stamps for a method that predicts only what comes after.
-        """
-
-
 def as_it_is(track: Track) -> Track:
     """The track itself."""
     return track
@@ -78,12 +56,13 @@ class GraphContender:
     """A dynamics model in the factor graph: smooth the observed part, predict the rest.
 
     Attributes:
-        name, parameter_count, training_seconds: as of any contender.
+        name: the method in `results.json`.
         model: the dynamics.  surfaces: on what it bounces.  settings: of the smoother.
         label: gives a track the spin label that its launcher settings mean, if the method knows that.
         onward: predict as `ballfg predict` does: the observed part is the smoothed one, the rest is rolled out from
             its last state, with the coefficients that the settings let each track have. False: the whole path is rolled
             out from the first state.
+        parameter_count: numbers that were learned, 0 for none.  training_seconds: s, wall clock; 0 without a training.
         failures: number of estimates that did not converge so far.
     """
 
@@ -98,7 +77,10 @@ class GraphContender:
     failures: int = 0
 
     def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
-        """Positions (n, 3) m at all stamps of each track."""
+        """Positions (n, 3) m at all stamps of some tracks, from their observed parts with their labels.
+
+        Args: times: (n,) s for each track, the stamps of the whole track, first those of the observed part.
+        """
         smoother = Smoother(self.model, self.surfaces, self.settings)
         estimates = [smoother.estimate(self.label(track)) for track in seen]
         self.failures += sum(estimate.status is not Status.OK for estimate in estimates)

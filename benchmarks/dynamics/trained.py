@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job, task_digest
+from ballfg.benchmarks.dynamics.contenders import GraphContender, Job, task_digest
 from ballfg.benchmarks.dynamics.task import Task
 from ballfg.benchmarks.estimators.measured import HORIZON
 from ballfg.dynamics import load_model
@@ -85,7 +85,25 @@ def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
     return content | ({"architecture": architecture} if architecture else {})
 
 
-def trained_contender(job: Job, task: Task) -> Contender:
+@dataclass
+class SequenceContender:
+    """A sequence model: predicts what follows the observed part; as `GraphContender`."""
+
+    name: str
+    parameter_count: int
+    training_seconds: float
+    predictor: SequencePredictor
+
+    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
+        """Positions (n, 3) m at all stamps of each track; NaN in the observed part."""
+        counts = [len(track) for track in seen]
+        rests = self.predictor.predict_many(
+            seen, counts, [stamps[count:] for stamps, count in zip(times, counts, strict=True)]
+        )
+        return [np.concatenate((np.full((count, 3), np.nan), rest)) for count, rest in zip(counts, rests, strict=True)]
+
+
+def trained_contender(job: Job, task: Task) -> GraphContender | SequenceContender:
     """Train the method, or go on with its training, and load what was exported; a contender for one of the tasks.
 
     Raises: ValueError: if the job's folder holds a training on other tracks or by another recipe.
@@ -171,21 +189,3 @@ def config_of(job: Job, data: Sequence[Path]) -> TrainConfig:
         "launcher": content.get("launcher", {}) | {"labels": first.launcher_labels},
     }
     return TrainConfig.model_validate(content | given)
-
-
-@dataclass
-class SequenceContender:
-    """A sequence model: predicts what follows the observed part, from that part alone."""
-
-    name: str
-    parameter_count: int
-    training_seconds: float
-    predictor: SequencePredictor
-
-    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
-        """Positions (n, 3) m at all stamps of each track; NaN in the observed part."""
-        counts = [len(track) for track in seen]
-        rests = self.predictor.predict_many(
-            seen, counts, [stamps[count:] for stamps, count in zip(times, counts, strict=True)]
-        )
-        return [np.concatenate((np.full((count, 3), np.nan), rest)) for count, rest in zip(counts, rests, strict=True)]

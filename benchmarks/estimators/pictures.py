@@ -10,6 +10,7 @@ import numpy as np
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, Measured, prediction_rmse
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, plain_ticks, save
 from ballfg.benchmarks.results import Row
+from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.estimation.track_prediction import TrackPrediction
 
 STYLES: dict[str, tuple[str, float, Any]] = {
@@ -24,7 +25,6 @@ STYLES: dict[str, tuple[str, float, Any]] = {
 OTHER = ("black", 2.0, "solid")  # Style of a method that has none of its own
 LEAST_SHOWN = 0.1  # Lower end of a band divided by its mean; a logarithmic axis has no place for zero
 EXAMPLES = 3  # Tracks shown one by one
-NINETY = 1.645  # Standard deviations to each side of a normal distribution's central 90 %
 
 
 def _line(method: str) -> dict[str, Any]:

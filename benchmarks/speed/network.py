@@ -24,21 +24,16 @@ FIT_ITERATIONS = 600  # Iterations of L-BFGS; the fit then errs by about a twent
 class NetworkFlight(BallModel):
     """Flight by gravity plus a 9-80-80-3 tanh network of velocity, spin and spin x velocity (7,523 parameters).
 
-    Bounces are another model's. Scales of inputs and output, and gravity, are folded into the first and the last layer.
+    Bounces are another model's.
 
     Args:
         bounces: the model of bounces, with its radius and inertia.
-        layers: linear layers from 9 scaled inputs to 3 scaled accelerations, tanh between them.
+        weights, biases: of linear layers from 9 inputs, as of `features`, to the acceleration, tanh between them.
     """
 
-    def __init__(self, bounces: BallModel, layers: Sequence[nn.Linear]) -> None:
+    def __init__(self, bounces: BallModel, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
         super().__init__(bounces.radius, bounces.inertia_factor)
         self.bounces = bounces
-        weights = [layer.weight.detach().clone() for layer in layers]
-        biases = [layer.bias.detach().clone() for layer in layers]
-        weights[0] /= SCALES
-        weights[-1] *= FORCE_SCALE
-        biases[-1] = FORCE_SCALE * biases[-1] + GRAVITY
         self.weights = nn.ParameterList(weights).requires_grad_(False)
         self.biases = nn.ParameterList(biases).requires_grad_(False)
         # the tensors themselves: asking modules for them costs as much as the small products
@@ -93,7 +88,12 @@ def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> Ne
         return value
 
     optimizer.step(loss)
-    return NetworkFlight(model, layers)
+    weights = [layer.weight.detach().clone() for layer in layers]
+    biases = [layer.bias.detach().clone() for layer in layers]
+    weights[0] /= SCALES  # scales of inputs and output, and gravity, are folded into the first and the last layer
+    weights[-1] *= FORCE_SCALE
+    biases[-1] = FORCE_SCALE * biases[-1] + GRAVITY
+    return NetworkFlight(model, weights, biases)
 
 
 def parameter_count(network: NetworkFlight) -> int:

@@ -3,12 +3,12 @@
 import numpy as np
 import torch
 from problem import LOSS_STEPS, ROLLOUT_STEPS, Array, Problem
-from torch import Tensor, nn
+from torch import Tensor
 
 from ballfg.arrays import Index
-from ballfg.dynamics import BallModel, Surfaces, rollout as roll_out
+from ballfg.benchmarks.speed.network import NetworkFlight
+from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout as roll_out
 from ballfg.dynamics.compiled.functions import compiled
-from ballfg.dynamics.model import Rates
 from ballfg.dynamics.model_file import model_from_dict
 from ballfg.factors.batch import FactorBatch, Noise, Values
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
@@ -73,31 +73,11 @@ def _stepped(model: BallModel, state: Tensor, dt: float) -> Tensor:
     return torch.cat(moved, dim=-1)
 
 
-class Network(BallModel):
-    """Flight by the problem's network."""
-
-    def __init__(self, problem: Problem) -> None:
-        super().__init__(0.02, 2.0 / 3.0)
-        pairs = [(torch.from_numpy(w), torch.from_numpy(b)) for w, b in problem.layers]
-        self.tables = nn.ParameterList([part for pair in pairs for part in pair]).requires_grad_(False)
-
-    def rates(self, state: Tensor) -> Rates:
-        """Acceleration; the spin is constant."""
-        v, w = state[..., VELOCITY], state[..., SPIN]
-        x = torch.cat((v, w, torch.linalg.cross(w, v)), dim=-1)
-        w1, b1, w2, b2, w3, b3 = self.tables
-        x = torch.tanh(nn.functional.linear(torch.tanh(nn.functional.linear(x, w1, b1)), w2, b2))
-        return nn.functional.linear(x, w3, b3), None
-
-    def after_bounce(self, state: Tensor) -> Tensor:
-        """There is nothing to bounce on."""
-        return state
-
-
 def model_of(problem: Problem) -> BallModel:
     """The problem's laws as a model."""
-    if problem.layers:
-        return Network(problem)
+    if problem.layers:  # there is nothing to bounce on
+        weights, biases = ([torch.from_numpy(part) for part in parts] for parts in zip(*problem.layers, strict=True))
+        return NetworkFlight(nominal_model(), weights, biases)
     gravity = {"g": -float(problem.gravity[2])}
     laws = {"gravity": gravity, "drag": {"k": float(problem.drag)}, "magnus": {"k": float(problem.magnus)}}
     return model_from_dict({"flight": laws, "bounce": {}})

@@ -11,7 +11,10 @@ import torch
 from ballfg.benchmarks.diagnosis.cases import (
     BARE,
     FULL,
+    PAIRS,
+    PLANTS,
     QUICK,
+    UNKNOWN,
     Case,
     Recording,
     detection_cases,
@@ -24,7 +27,6 @@ from ballfg.benchmarks.diagnosis.cases import (
     unknown_cases,
 )
 from ballfg.benchmarks.diagnosis.data import actual_model, declared_model, make_dataset
-from ballfg.benchmarks.diagnosis.effects import PAIRS, PLANTS, UNKNOWN
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
 from ballfg.simulation import SimulationConfig, parse_effects
 from tests.places import ROOT

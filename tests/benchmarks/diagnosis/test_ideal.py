@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.diagnosis.cases import Recording
-from ballfg.benchmarks.diagnosis.effects import PLANTS
+from ballfg.benchmarks.diagnosis.cases import PLANTS, Recording
 from ballfg.benchmarks.diagnosis.ideal import (
     LEVEL,
     Ideal,

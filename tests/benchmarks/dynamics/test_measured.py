@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.dynamics.contenders import Job, adapting_contender, job_digest, nominal_contender, task_digest
-from ballfg.benchmarks.dynamics.jobs import collect_records, judged, record_path
 from ballfg.benchmarks.dynamics.measured import Measured, measured_task, measured_tasks
-from ballfg.benchmarks.dynamics.suite import Plan, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Plan, collect_records, judged, record_path, run_dynamics
 from ballfg.benchmarks.dynamics.task import Task, TaskShot
 from ballfg.benchmarks.dynamics.trained import config_of, recipe, trained_contender
 from ballfg.benchmarks.estimators.measured import run_measured

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.dynamics.contenders import Job, Record, fan_of, nominal_contender, task_digest, truth_contender
-from ballfg.benchmarks.dynamics.jobs import METHODS, collect_records
 from ballfg.benchmarks.dynamics.measured import measured_shot
-from ballfg.benchmarks.dynamics.suite import Plan, _installed, add_rows, run_dynamics
+from ballfg.benchmarks.dynamics.suite import METHODS, Plan, _installed, add_rows, collect_records, run_dynamics
 from ballfg.benchmarks.dynamics.trained import _finished
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results

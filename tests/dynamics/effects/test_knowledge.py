@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.benchmarks.diagnosis.effects import PLANTS
+from ballfg.benchmarks.diagnosis.cases import PLANTS
 from ballfg.diagnosis.report.wording import in_plain_words, plain_name
 from ballfg.diagnosis.result import Finding, Value
 from ballfg.diagnosis.search.ranking import implausible, range_of
