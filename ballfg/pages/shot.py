@@ -225,20 +225,15 @@ def coverage(shots: Iterable[ShownShot]) -> Coverage:
 
     Args: shots: with samples and predictions; samples outside of the predicted part are left out.
     """
-    held: dict[int, Array] = {}
-    samples: dict[int, int] = {}
-    tracks: dict[int, int] = {}
+    inside, bins, first = [np.zeros((0, 3), dtype=bool)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for shot in shots:
         errors, ahead = np.abs(shot.prediction_errors()), shot.horizons()
         known = np.isfinite(errors).all(axis=1) & np.isfinite(ahead) & ~np.isnan(shot.predicted_sigmas).any(axis=1)
-        inside = errors[known] <= HALF_WIDTH * shot.predicted_sigmas[known]
-        bins = np.floor((ahead[known] + SAME_STAMP) / BIN).astype(int)
-        for b in np.unique(bins).tolist():
-            held[b] = held.get(b, np.zeros(3)) + inside[bins == b].sum(axis=0)
-            samples[b] = samples.get(b, 0) + int((bins == b).sum())
-            tracks[b] = tracks.get(b, 0) + 1
-    order = sorted(held)
-    counts = np.array([samples[b] for b in order], dtype=np.int64)
-    sums = np.array([held[b] for b in order]).reshape(-1, 3)
-    middles = (np.array(order, dtype=np.float64) + 0.5) * BIN
-    return Coverage(middles, sums / counts[:, None], counts, np.array([tracks[b] for b in order], dtype=np.int64))
+        inside.append(errors[known] <= HALF_WIDTH * shot.predicted_sigmas[known])
+        bins.append(np.floor((ahead[known] + SAME_STAMP) / BIN).astype(np.int64))
+        first.append(np.unique(bins[-1]))
+    order, place, counts = np.unique(np.concatenate(bins), return_inverse=True, return_counts=True)
+    sums = np.zeros((len(order), 3))
+    np.add.at(sums, place, np.concatenate(inside))
+    tracks = np.bincount(np.searchsorted(order, np.concatenate(first)), minlength=len(order))
+    return Coverage(np.asarray((order + 0.5) * BIN), sums / counts[:, None], counts, tracks)

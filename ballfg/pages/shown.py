@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -137,22 +138,20 @@ def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[ShownSh
 
 
 def _shot(given: Given, name: str, track: Track | None) -> ShownShot:
-    shot = ShownShot(name)
+    parts: dict[str, Any] = {}
     if track is not None:
-        unknown = np.full(track.positions.shape, np.nan)
-        noise = unknown if track.sigmas is None else track.sigmas
-        seen = sight(track) if track.rough else None
-        shot = replace(shot, times=track.times, positions=track.positions, noise=noise, sight=seen)
-    if given.states is not None:
-        rows = _rows(given.states, name, track)
-        shot = replace(shot, state_times=rows[:, 0], states=rows[:, 1:10], state_sigmas=rows[:, 10:])
-        own, which = given.states, given.states.rows.get(name, slice(0))
-        shot = replace(shot, labels=own.labels[which], correlations=own.correlations[which])
-    if given.predictions is not None:
-        rows = _rows(given.predictions, name, track)
-        shot = replace(shot, predicted_times=rows[:, 0], predicted=rows[:, 1:4], predicted_sigmas=rows[:, 4:])
-        shot = replace(shot, flights=given.predictions.flights[given.predictions.rows.get(name, slice(0))])
-    return shot.on_rays
+        noise = np.full(track.positions.shape, np.nan) if track.sigmas is None else track.sigmas
+        parts |= {"times": track.times, "positions": track.positions, "noise": noise}
+        parts["sight"] = sight(track) if track.rough else None
+    if (own := given.states) is not None:
+        rows, which = _rows(own, name, track), own.rows.get(name, slice(0))
+        parts |= {"state_times": rows[:, 0], "states": rows[:, 1:10], "state_sigmas": rows[:, 10:]}
+        parts |= {"labels": own.labels[which], "correlations": own.correlations[which]}
+    if (own := given.predictions) is not None:
+        rows, which = _rows(own, name, track), own.rows.get(name, slice(0))
+        parts |= {"predicted_times": rows[:, 0], "predicted": rows[:, 1:4], "predicted_sigmas": rows[:, 4:]}
+        parts["flights"] = own.flights[which]
+    return ShownShot(name, **parts).on_rays
 
 
 def _rows(table: ResultTable, name: str, track: Track | None) -> Array:
