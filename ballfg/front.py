@@ -91,10 +91,9 @@ def estimate(
     data = _opened(measured)
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
-        from ballfg.estimation.flights.estimates import Seen
+        from ballfg.estimation.flights.estimates import estimated
 
-        seen = Seen.of(estimator, data)
-        return seen.labelled(estimator.estimate(data)) if seen.whole else seen.estimated(estimator)
+        return estimated(estimator, data)
     from ballfg.estimation.batch import estimate_tracks
 
     return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, flights=True)}

@@ -14,7 +14,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.parallel.executor import executor
 from ballfg.parallel.parts import jobs_here, with_jobs
 from ballfg.parallel.processes import Processes
-from ballfg.parallel.stream import finished, in_order, shared
+from ballfg.parallel.stream import finished, in_order
 from ballfg.parallel.work import each, on_one_thread
 from ballfg.tracks import Track
 
@@ -117,5 +117,5 @@ def do_all(tasks: Sequence[Callable[[], R]], jobs: int) -> list[R]:
     if others is None or len(tasks) < 2:
         return [task() for task in tasks]
     if others.helped:
-        return shared(operator.call, tasks, others)
+        return list(in_order(partial(each, operator.call), _chunks(iter(tasks), 1), others))
     return [result for _, result in sorted(finished(operator.call, tasks, others), key=lambda pair: pair[0])]

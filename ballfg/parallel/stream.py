@@ -81,8 +81,3 @@ def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor)
     finally:
         for one in pending.values():
             one.cancel()
-
-
-def shared(function: Callable[[T], R], items: Iterable[T], executor: Executor) -> list[R]:
-    """The results of items in order; this process computes some of them too. Raises: the function's exceptions."""
-    return list(in_order(partial(each, function), ([item] for item in items), executor))

@@ -12,10 +12,11 @@ from typing import Any
 
 import pytest
 
+from ballfg.estimation.batch import do_all
 from ballfg.parallel.executor import executor
 from ballfg.parallel.processes import Processes
 from ballfg.parallel.same_versions import own_versions
-from ballfg.parallel.stream import AHEAD, HELPED, finished, in_order, shared
+from ballfg.parallel.stream import AHEAD, HELPED, finished, in_order
 from ballfg.parallel.work import KEPT, Work, _functions, compute, packed
 
 NUMBERS = list(range(60))
@@ -132,7 +133,7 @@ def test_a_chunk_that_ends_every_process_is_given_up(monkeypatch: pytest.MonkeyP
 
 
 def test_long_tasks_are_shared_with_this_process() -> None:
-    found = shared(slow_square, range(6), Processes(2))
+    found = do_all([partial(slow_square, number) for number in range(6)], 2)
     assert [value for value, _ in found] == [0, 1, 4, 9, 16, 25]
     assert os.getpid() in {pid for _, pid in found}
 
@@ -145,7 +146,7 @@ def test_long_tasks_hand_their_numbers_over_as_they_finish() -> None:
 def test_an_error_in_another_process_ends_shared_tasks() -> None:
     Processes(1, helped=False).sender(squares)([0]).result()  # one is there
     with pytest.raises(ValueError, match="seven"):
-        shared(partial(_refused_one, os.getpid()), range(8), Processes(2))
+        do_all([partial(_refused_one, os.getpid(), number) for number in range(8)], 2)
 
 
 def _refused_one(own: int, number: int) -> int:
