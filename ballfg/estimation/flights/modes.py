@@ -124,22 +124,13 @@ def _wandered(s: float) -> Any:
     )
 
 
-@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL))
-def _accelerated(h: Record, axis: int, mean: float, spread: float) -> None:
-    """Forgets the acceleration of an axis: mean and spread m/s^2."""
-    h.mean[axis, 2] = mean
+@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, COUNT, REAL, REAL))
+def _forget(h: Record, axis: int, order: int, mean: float, spread: float) -> None:
+    """Forgets the velocity (order 1, m/s) or the acceleration (order 2, m/s^2) of an axis: mean and spread."""
+    h.mean[axis, order] = mean
     for k in range(3):
-        h.cov[axis, 2, k] = h.cov[axis, k, 2] = 0.0
-    h.cov[axis, 2, 2] = spread * spread
-
-
-@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, REAL, REAL))
-def _moving(h: Record, axis: int, mean: float, spread: float) -> None:
-    """Forgets the velocity of an axis: mean and spread m/s."""
-    h.mean[axis, 1] = mean
-    for k in range(3):
-        h.cov[axis, 1, k] = h.cov[axis, k, 1] = 0.0
-    h.cov[axis, 1, 1] = spread * spread
+        h.cov[axis, order, k] = h.cov[axis, k, order] = 0.0
+    h.cov[axis, order, order] = spread * spread
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, SCENE))
@@ -151,14 +142,14 @@ def enter(h: Record, mode: int, scene: Record) -> None:
         h.age = 0
     for axis in range(3):
         if mode == FLYING:
-            _accelerated(h, axis, 0.0, air(h, scene))
+            _forget(h, axis, 2, 0.0, air(h, scene))
         elif mode <= SWAYED or (mode == ROLLING and axis < 2):
-            _accelerated(h, axis, 0.0, STOPPING if mode == HANDLED and before == FLYING else PULLS[mode])
+            _forget(h, axis, 2, 0.0, STOPPING if mode == HANDLED and before == FLYING else PULLS[mode])
         else:
             spread = LANDING * LANDING + h.cov[axis, 1, 1]
             h.score -= 0.5 * h.mean[axis, 1] ** 2 / spread
-            _moving(h, axis, 0.0, SLOPE if mode == ROLLING else 0.0)
-            _accelerated(h, axis, 0.0, 0.0)
+            _forget(h, axis, 1, 0.0, SLOPE if mode == ROLLING else 0.0)
+            _forget(h, axis, 2, 0.0, 0.0)
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL))
@@ -166,7 +157,7 @@ def stop(h: Record, dt: float) -> None:
     """A ball stops suddenly in a hand, at some time of the next interval of dt s."""
     for axis in range(3):
         h.cov[axis, 0, 0] += (h.mean[axis, 1] * dt) ** 2 / 3.0
-        _moving(h, axis, 0.0, HAND_SPEED)
+        _forget(h, axis, 1, 0.0, HAND_SPEED)
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
@@ -176,8 +167,8 @@ def strike(h: Record, dt: float, scene: Record) -> None:
     reach = scene.hit_spread**2 + (STRIKE_SPEED * min(dt, scene.short_gap)) ** 2
     for axis in range(3):
         h.cov[axis, 0, 0] += reach
-        _moving(h, axis, 0.0, STRIKE_SPEED)
-        _accelerated(h, axis, 0.0, scene.slack)
+        _forget(h, axis, 1, 0.0, STRIKE_SPEED)
+        _forget(h, axis, 2, 0.0, scene.slack)
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, SCENE))
@@ -200,7 +191,7 @@ def bounce(h: Record, dt: float, scene: Record) -> bool:
     up = RESTITUTION * fall
     h.mean[2, 0] -= 0.5 * turn * dt  # `move` adds the new velocity over all of the interval
     h.cov[2, 0, 0] += (turn * dt) ** 2 / 12.0 + scene.surface_sigma**2
-    _moving(h, 2, up, math.sqrt((RESTITUTION_SIGMA * fall) ** 2 + BOUNCE_JITTER**2 + h.cov[2, 1, 1]))
+    _forget(h, 2, 1, up, math.sqrt((RESTITUTION_SIGMA * fall) ** 2 + BOUNCE_JITTER**2 + h.cov[2, 1, 1]))
     for axis in range(2):
         h.mean[axis, 1] *= KEPT
         h.cov[axis, 1, 1] += (SLIDE * fall + BOUNCE_JITTER) ** 2
