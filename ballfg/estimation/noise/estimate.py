@@ -84,11 +84,6 @@ class NoiseEstimate:
     tracks: int
     starts: int
 
-    @property
-    def coefficient_factor(self) -> float:
-        """The geometric mean of `coefficient_factors`; 1 without coefficients."""
-        return float(np.exp(np.log(list(self.coefficient_factors.values()) or 1.0).mean()))
-
 
 def estimate_noise(
     model: BallModel,

@@ -68,23 +68,6 @@ def multiply(x, y, result):
                 result[i, j] += x[i, s] * y[s, j]
 
 
-@machine_code(NOTHING(TWO, TWO))
-def transpose(x, result):
-    """The transpose of x (w, w)."""
-    for i in range(len(x)):
-        for j in range(len(x)):
-            result[i, j] = x[j, i]
-
-
-@machine_code(FLAG(TWO))
-def is_something(covariance):
-    """True if a covariance is not zero, by its diagonal."""
-    total = 0.0
-    for i in range(len(covariance)):
-        total += covariance[i, i]
-    return total != 0.0
-
-
 @machine_code(FLAG(TWO, TWO))
 def invert_root(x, inverse):
     """Writes the inverse (3, 3) of the Cholesky root of x (3, 3); False if x is not positive definite."""
@@ -123,10 +106,10 @@ def _predict(transition, offset, decay, kicks, process, memory, m, p, work):
     for i in range(STATE_DIM, d):
         m[i] += offset[i]
     move(transition, decay, p, work[0])
-    transpose(work[0], work[1])
+    work[1] = work[0].T
     move(transition, decay, work[1], p)
     for q in range(len(process)):
-        if is_something(kicks[q]):  # few intervals have a contact
+        if np.trace(kicks[q]) != 0.0:  # few intervals have a contact
             for i in range(STATE_DIM):
                 for j in range(STATE_DIM):
                     p[i, j] += process[q] * kicks[q, i, j]
@@ -205,7 +188,7 @@ def _join(d, gain, prior, measured, p, work):
             if d < w:
                 kept[i, d + a] -= gain[i, a]
     multiply(kept, prior, half)
-    transpose(kept, prior)
+    prior[:] = kept.T
     multiply(half, prior, p)
     for a in range(3):
         for b in range(3):

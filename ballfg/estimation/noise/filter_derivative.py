@@ -13,7 +13,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
-from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, is_something, pull, transpose
+from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, pull
 from ballfg.state import STATE_DIM
 
 
@@ -81,12 +81,12 @@ def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, t
     """
     d, w, to_decay = len(transition), len(m), 0.0
     for q in range(len(to_process)):
-        if is_something(kicks[q]):
+        if np.trace(kicks[q]) != 0.0:
             for i in range(STATE_DIM):
                 for j in range(STATE_DIM):
                     to_process[q] += kicks[q, i, j] * p[i, j]
     pull(transition, decay, p, work[0])
-    transpose(work[0], work[1])
+    work[1] = work[0].T
     for i in range(d, w):
         to_memory[i - d] += p[i, i] * (1.0 - decay * decay)
         to_decay += m[i] * before[i] - 2.0 * decay * memory[i - d] * p[i, i]

@@ -38,12 +38,10 @@ class Score:
     Attributes:
         by_track: (t,) each track's share of the mean negative logarithm of a density, of forecasts and next samples.
         held: share of forecast coordinates inside the central 90 % intervals.
-        starts: number of forecast origins.
     """
 
     by_track: Tensor
     held: float
-    starts: int
 
     @property
     def value(self) -> Tensor:
@@ -96,7 +94,7 @@ class Forecaster:
         filtered = self.filter.run(noise, measured)
         total, inside, count = self._forecast(filtered, noise, measured)
         by_track = total / max(count, 1) + self.next_samples * filtered.nll / max(filtered.count, 1)
-        return Score(by_track, inside / max(3 * count, 1), len(self.starts))
+        return Score(by_track, inside / max(3 * count, 1))
 
     def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
         """(t,) summed scores of forecasts, number of coordinates in their 90 % intervals, number of forecasts."""
