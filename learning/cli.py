@@ -60,7 +60,7 @@ def train(
     if not settings.data:
         raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
     folder, own = Path(settings.out), (effects_file or [], observations_file or [])
-    _know(*own)
+    inputs.know(*own)
     if isinstance(settings, CalibrationConfig):
         if isinstance(settings.data, str):
             from ballfg.learning.calibration.run import run_calibration as calibrate
@@ -75,12 +75,6 @@ def train(
         status = _train(settings, folder, resume is not None, typed, own)
     if status:
         raise SystemExit(status)
-
-
-def _know(effects: list[Path], observations: list[Path]) -> None:
-    """Registers effects and observations of one's own in this process."""
-    inputs.know_effects(effects)
-    inputs.know_observations(observations)
 
 
 def _train(config: "TrainConfig", folder: Path, resume: bool, typed: str, own: OwnFiles) -> int:
@@ -113,7 +107,7 @@ def _train_guarded(config: "TrainConfig", folder: Path, resume: bool, typed: str
     def work() -> int:
         try:
             with alive("ballfg-train"):
-                _know(*own)
+                inputs.know(*own)
                 return _train_here(config, folder, resume, typed)
         except KeyboardInterrupt:  # this command says so
             return NO_STATUS

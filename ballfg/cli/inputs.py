@@ -175,19 +175,15 @@ def filtered(data: "Dataset | SightedDataset") -> tuple[str, ...]:
     return in_flight(data, TRACKS_FOR_TABLE).filtered if isinstance(data, Dataset) else ()
 
 
-def know_effects(files: Iterable[Path] | None) -> None:
-    """Registers the effects in files, so that model files and options can name them."""
-    from ballfg.dynamics import load_effects
+def know(effects: Iterable[Path] | None = None, observations: Iterable[Path] | None = None) -> None:
+    """Registers the classes in files: effects for model files and options, observations for tables of datasets."""
+    for file in effects or ():
+        from ballfg.dynamics import load_effects
 
-    for file in files or ():
         load_effects(file)
+    for file in observations or ():
+        from ballfg.estimation.observations.registry import load_observations
 
-
-def know_observations(files: Iterable[Path] | None) -> None:
-    """Registers the observations in files, so that their tables are read with a dataset."""
-    from ballfg.estimation.observations.registry import load_observations
-
-    for file in files or ():
         load_observations(file)
 
 
@@ -209,22 +205,11 @@ def open_inputs(
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
-    know_effects(effects_files)
+    know(effects_files)
     data = with_readings(read_dataset(dataset))
     found, doubts = _opened(data, model, ball)
     start_early(len(data))
     return Inputs(data, found, dataset_surfaces(data), observed, doubts)
-
-
-def open_sighted(
-    dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, ball: str | None = None
-) -> "Inputs[SightedDataset]":
-    """`open_inputs` for sightings."""
-    from ballfg.estimation import dataset_surfaces, read_sighted
-
-    know_effects(effects_files)
-    data = read_sighted(dataset)
-    return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), math.inf)
 
 
 def open_source(
@@ -235,10 +220,14 @@ def open_source(
     observed: float = math.inf,
     ball: str | None = None,
 ) -> Inputs[Any]:
-    """`open_inputs` or `open_sighted`."""
-    if is_sighted(source, dataset):
-        return open_sighted(dataset, model, effects_files, ball)
-    return open_inputs(dataset, model, effects_files, observed, ball)
+    """`open_inputs`, also for the sightings of a dataset."""
+    if not is_sighted(source, dataset):
+        return open_inputs(dataset, model, effects_files, observed, ball)
+    from ballfg.estimation import dataset_surfaces, read_sighted
+
+    know(effects_files)
+    data = read_sighted(dataset)
+    return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), math.inf)
 
 
 def is_sighted(source: str | None, dataset: Path) -> bool:

@@ -36,7 +36,7 @@ def compile_ahead(
     from ballfg.dynamics.known_balls import KNOWN_BALLS
     from ballfg.dynamics.nominal import keep_nominal
 
-    inputs.know_effects(effects_file)
+    inputs.know(effects_file)
     models: dict[str, BallModel] = {name: nominal_model(name) for name in KNOWN_BALLS}
     inertia = KNOWN_BALLS["table_tennis"].inertia_factor
     files = {path: load_model(path, inertia_factor=inertia) for path in model or ()}
@@ -120,7 +120,7 @@ def export(
     check_file(out)
     if out.suffix != ".h":
         raise ValueError(f"out must be a header; got {out}. Let its name end in .h.")
-    inputs.know_effects(effects_file)
+    inputs.know(effects_file)
     path = None if re.fullmatch(r"[\w -]+", model) and not Path(model).is_file() else Path(model)
     if path is None and ball is not None:
         raise ValueError(f"ball must come with a model file; got {ball!r} with '{model}'. Leave one of them out.")

@@ -67,7 +67,7 @@ def design(
     """
     if stand is not None or candidates is None:
         shots_only = {"candidates": candidates, "between": between, "shrink": shrink, "diagnosis": diagnosis}
-        inputs.know_observations(observations_file)
+        inputs.know(observations=observations_file)
         _stand(dataset, stand, cameras, noise, model, effects_file, out, jobs, shots=shots, seed=seed, **shots_only)
         return
     for name, value in (("cameras", cameras), ("noise", noise)):
@@ -79,7 +79,7 @@ def design(
     from ballfg.tracks import TableWriter
 
     levels = parse_levels(candidates)
-    inputs.know_observations(observations_file)
+    inputs.know(observations=observations_file)
     if out is not None:
         TableWriter(out, name="out")  # refuses a path that cannot be written
         inputs.check_out(out, dataset)

@@ -63,7 +63,7 @@ def diagnose(
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
     with reserved(out):  # until the report is written: a diagnosis takes minutes
         check_report_folder(out, force=force)
-        inputs.know_observations(observations_file)
+        inputs.know(observations=observations_file)
         opened, *others = [
             inputs.open_source(source, dataset, model, effects_file).in_flight(anyway) for dataset in datasets
         ]

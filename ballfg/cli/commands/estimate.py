@@ -60,7 +60,7 @@ def estimate(
     outcome = Outcome()
     rows = hits = flying = 0
     with TableWriter(out, name="out") as table, inputs.workers(cluster, address, jobs) as workers:
-        inputs.know_observations(observations_file)
+        inputs.know(observations=observations_file)
         inputs.check_out(out, dataset)
         opened = inputs.open_source(source, dataset, model, effects_file, ball=ball)
         print_doubts(inputs.filtered(opened.dataset))

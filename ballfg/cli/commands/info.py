@@ -143,7 +143,7 @@ def effects(
     """
     from ballfg.dynamics import EFFECTS
 
-    inputs.know_effects(effects_file)
+    inputs.know(effects_file)
     for chosen in [EFFECTS.lookup(name) for name in names or ()]:
         typer.echo("\n".join(_described(chosen)) + "\n")
     if not names:

@@ -100,8 +100,7 @@ def live(
             raise ValueError(
                 f"out must be JSON lines or a bag in MCAP; got {out}. Let its name end in .jsonl or .mcap."
             )
-    inputs.know_effects(effects_file)
-    inputs.know_observations(observations_file)
+    inputs.know(effects_file, observations_file)
     bag = replay is not None and (replay.suffix in (MCAP, SQLITE) or (replay / "metadata.yaml").is_file())
     data = _dataset(like if bag or replay is None else replay)
     known, surfaces, settings = _scene(data, model, ball, table, noise, group)

@@ -16,31 +16,24 @@ if TYPE_CHECKING:
     from ballfg.tracks import Dataset
 
 MEANINGS = {
-    "position": ("error of a position, new in each sample, along {}", 1e3, "mm"),
-    "memory": ("error of a position that lasts, along {}", 1e3, "mm"),
-    "memory_time": ("time over which it lasts", 1e3, "ms"),
-    "stamp_jitter": ("error of a stamp", 1e3, "ms"),
-    "spin_label": ("error of a spin label, per axis", 1.0, "rad/s"),
-    "spin_prior": ("spin of a ball without a label, per axis", 1.0, "rad/s"),
-    "acceleration": ("acceleration that the model lacks", 1.0, "m/s^2/sqrt(Hz)"),
-    "contact_velocity": ("scatter of the velocity after a bounce", 1.0, "m/s"),
-    "contact_tangential": ("the same, in addition, along the surface", 1.0, "m/s"),
-    "contact_spin": ("scatter of the spin after a bounce", 1.0, "rad/s"),
-    "coefficients": ("spread of {} / its usual one", 1.0, ""),
+    "position": ("error of a position, new in each sample, along {}", 1e3, "mm", 0.5),
+    "memory": ("error of a position that lasts, along {}", 1e3, "mm", 0.5),
+    "memory_time": ("time over which it lasts", 1e3, "ms", math.inf),
+    "stamp_jitter": ("error of a stamp", 1e3, "ms", 0.05),
+    "spin_label": ("error of a spin label, per axis", 1.0, "rad/s", 2000.0),
+    "spin_prior": ("spin of a ball without a label, per axis", 1.0, "rad/s", 2000.0),
+    "acceleration": ("acceleration that the model lacks", 1.0, "m/s^2/sqrt(Hz)", 100.0),
+    "contact_velocity": ("scatter of the velocity after a bounce", 1.0, "m/s", 20.0),
+    "contact_tangential": ("the same, in addition, along the surface", 1.0, "m/s", 20.0),
+    "contact_spin": ("scatter of the spin after a bounce", 1.0, "rad/s", 2000.0),
+    "coefficients": ("spread of {} / its usual one", 1.0, "", 30.0),
 }
-"""Meaning of each number, factor to its printed unit, and that unit."""
+"""Meaning of each number, factor to its printed unit, that unit, and in SI units the largest of a tracked ball."""
 UNKNOWN = 0.7  # Standard deviation of a logarithm beyond which the tracks give hardly more than the order of magnitude
 
 MOST_ERROR = 3.0  # The same that is printed at most, a factor of 20: beyond, the limits say what is known
 
 PRIOR = 1.2  # The same of positions from which the tracks say nothing: it is the prior's
-MOST = {
-    "position": 0.5, "memory": 0.5, "stamp_jitter": 0.05, "spin_label": 2000.0, "spin_prior": 2000.0,
-    "acceleration": 100.0, "contact_velocity": 20.0, "contact_tangential": 20.0, "contact_spin": 2000.0,
-    "coefficients": 30.0,
-}  # fmt: skip
-"""Largest noise of a ball that is tracked, by the names of `MEANINGS`, in SI units."""
-
 STREAK = ("error of a sighting, along each axis", "in addition, along its streak")
 LEAST_STREAK = 0.01  # Share of a sighting's error below which it has no streak
 
@@ -74,14 +67,13 @@ def noise(
     from ballfg.estimation.reading import with_readings
     from ballfg.tracks import read_dataset
 
-    inputs.know_effects(effects_file)
-    inputs.know_observations(observations_file)
+    inputs.know(effects_file, observations_file)
     if inputs.is_sighted(source, dataset):
         if out is not None or write:
             raise ValueError(
                 "--out and --write must be left out for detections: models and dataset.yaml hold no pixels"
             )
-        _of_pixels(inputs.open_sighted(dataset, model), tracks)
+        _of_pixels(inputs.open_source("detections", dataset, model), tracks)
         return
     if out is not None:
         inputs.check_model_out(out)
@@ -134,13 +126,11 @@ def check_known(found: "NoiseEstimate", dataset: Path) -> None:
     positions = [name for name in found.relative_errors if name.startswith("position")]
     unknown = min((found.relative_errors[name] for name in positions), default=0.0) >= PRIOR
     unknown = unknown and all(math.isinf(found.intervals[name][1]) for name in positions)  # else they are exact
-    numbers = _numbers(found)
-    largest = {
-        field: max((n for name, n in numbers.items() if name.split(".")[0] == field), default=0.0) for field in MOST
-    }
-    absurd = [
-        f"{MEANINGS[name][0].partition(',')[0]} {largest[name]:.2g}" for name in MOST if largest[name] > MOST[name]
-    ]
+    absurd, numbers = list[str](), _numbers(found)
+    for field, (meaning, _, _, most) in MEANINGS.items():
+        largest = max((number for name, number in numbers.items() if name.split(".")[0] == field), default=0.0)
+        if largest > most:
+            absurd.append(f"{meaning.partition(',')[0]} {largest:.2g}")
     if unknown or absurd:
         why = f"it would be: {', '.join(absurd)}" if absurd else f"they allow {found.starts} forecasts only"
         raise ValueError(
@@ -166,7 +156,7 @@ def _table(found: "NoiseEstimate") -> list[str]:
     lines, numbers = [], _numbers(found)
     for name, error in found.relative_errors.items():
         field, _, axis = name.partition(".")
-        meaning, factor, unit = MEANINGS[field]
+        meaning, factor, unit, _ = MEANINGS[field]
         number = factor * numbers[name]
         doubt = "  (hardly known)" if error >= UNKNOWN else ""
         limits = _limits(*(factor * limit for limit in found.intervals[name]))

@@ -106,7 +106,7 @@ def predict(
             check_file(save_conformal, "save_conformal")
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
-        inputs.know_observations(observations_file)
+        inputs.know(observations=observations_file)
         inputs.check_out(out, dataset)
         opened = inputs.open_source(source, dataset, model, effects_file, observe, ball).in_flight(anyway)
         count = len(opened.dataset)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
+from ballfg.cli.inputs import EffectsFiles, Seed, know
 from ballfg.progress import counted, progress
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def render(
     from ballfg.simulation.scene.recording import check_scene_folder
     from ballfg.simulation.settings import parse_settings
 
-    know_effects(effects_file)
+    know(effects_file)
     check_scene_folder(out, force=force)
     parts = re.fullmatch(r"\s*([+-]?\d+)\s*x\s*([+-]?\d+)\s*", size)
     if parts is None:

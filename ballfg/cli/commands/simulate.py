@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
+from ballfg.cli.inputs import EffectsFiles, Seed, know
 from ballfg.progress import counted, progress
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def simulate(
     from ballfg.simulation.settings import parse_settings
     from ballfg.simulation.writing import FileFormat
 
-    know_effects(effects_file)
+    know(effects_file)
     config = simulation.SimulationConfig(
         tracks=tracks,
         rate=rate,

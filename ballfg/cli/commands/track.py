@@ -1,7 +1,7 @@
 """Implements `ballfg track`, which turns videos of calibrated cameras into tracks."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -97,8 +97,9 @@ def track(
 
     kind = ball_kind(ball)
     if cameras is None:
-        given = {"stamps": stamps, "without": without, "colour": colour, "detector": detector}
-        _refuse_moving(**given, table_height=table_height, table=table, time_offsets=time_offsets)
+        given: dict[str, object] = {"stamps": stamps, "without": without, "colour": colour, "detector": detector}
+        given |= {"table-height": table_height, "table": table, "time-offsets": time_offsets}
+        _refuse("without --cameras", given)
         _moving_camera(recordings, out, kind, court, corners, candidates, name, jobs=jobs, force=force)
         return
     if (corners, candidates) != (None, None):
@@ -121,7 +122,8 @@ def track(
             raise ValueError("--time-offsets needs two cameras: they are relative to the first. Leave it out.")
         streams: Streams | None = None
         if len(recordings) == 1 and recordings[0].lower().endswith(".csv"):
-            _refuse(stamps=stamps, colour=colour, detector=detector)
+            videos_only = {"stamps": stamps, "colour": colour, "detector": detector}
+            _refuse("with detections: it is about videos", videos_only)
             detections, notes = read_detections(Path(recordings[0]), rig, without or ())
             print_notes(notes)
         else:
@@ -226,22 +228,12 @@ def _moving_camera(
         )
 
 
-def _refuse_moving(**options: object) -> None:
-    """Raises ValueError for an option that calibrated cameras need."""
+def _refuse(where: str, options: Mapping[str, object]) -> None:
+    """Raises ValueError for an option that is given where it has no use."""
     for name, value in options.items():
-        if value:
-            option = name.replace("_", "-")
+        if value not in (None, False):
             got = "" if value is True else f"; got {value}"
-            raise ValueError(f"--{option} must not be given without --cameras{got}. Leave it out.")
-
-
-def _refuse(**options: object) -> None:
-    """Raises ValueError for an option that only videos use."""
-    for name, value in options.items():
-        if value is not None:
-            raise ValueError(
-                f"--{name} must not be given with detections: it is about videos; got {value}. Leave it out."
-            )
+            raise ValueError(f"--{name} must not be given {where}{got}. Leave it out.")
 
 
 def _from_videos(
