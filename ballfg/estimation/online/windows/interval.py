@@ -109,21 +109,13 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
             result[k] = pieces[row]
         ended = [k for k in members if k < len(after)]  # the first ones: members ascend
         if ended:
-            whole, count = [intervals[k] for k in ended], len(ended)
-            _keep(whole, batch.whitening[:count], pieces[:count], start[ended], after[ended], coefficients)
+            store([intervals[k] for k in ended], start[ended], after[ended], coefficients, pieces[: len(ended)])
     return result
 
 
 def store(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array, pieces: Array) -> None:
     """Whitens the propagations of k intervals and stores them for iSAM2's queries; `pieces` as from `evaluate`."""
-    roots = np.concatenate([interval.batch.whitening for interval in intervals])
-    _keep(intervals, roots, pieces, start, after, coefficients)
-
-
-def _keep(
-    intervals: Sequence[Interval], root: Array, pieces: Array, start: Array, after: Array, coefficients: Array
-) -> None:
-    """Stores the inputs (k, d), residuals (k, 9) and Jacobians (k, 9, d) of intervals."""
+    root = np.concatenate([interval.batch.whitening for interval in intervals])
     start, after = start[:, :STATE_DIM], after[:, :STATE_DIM]
     residual, by_start = whiten(plain(root), plain(after), plain(pieces[:, :, 0]), plain(pieces[:, :, 1:]))
     inputs: tuple[Array, ...] = (start, after)
