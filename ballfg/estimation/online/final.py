@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -86,17 +87,10 @@ class Leaving:
 
 def _oldest(estimate: Estimate, count: int) -> Estimate:
     """The first states of an estimate, so many, and the events up to the next one."""
-    return replace(
-        estimate,
-        times=estimate.times[:count],
-        states=estimate.states[:count],
-        covariances=estimate.covariances[:count],
-        other_sides=estimate.other_sides[:count],
-        cross_covariances=estimate.cross_covariances[:count],
-        contacts=tuple(contact for contact in estimate.contacts if contact.interval < count),
-        hits=estimate.hits[estimate.hits < count],
-        quality=estimate.quality[:count],
-    )
+    by_sample = ("times", "states", "covariances", "other_sides", "cross_covariances", "quality")
+    contacts = tuple(contact for contact in estimate.contacts if contact.interval < count)
+    first: dict[str, Any] = {name: getattr(estimate, name)[:count] for name in by_sample}
+    return replace(estimate, **first, contacts=contacts, hits=estimate.hits[estimate.hits < count])
 
 
 def unknown(sample: Sample, settings: Settings) -> tuple[Array, Array]:
