@@ -91,9 +91,10 @@ def estimate(
     data = _opened(measured)
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
-        from ballfg.estimation.flights.estimates import estimated
+        from ballfg.estimation.flights.estimates import Seen
 
-        return estimated(estimator, data)
+        seen = Seen.of(estimator, data)
+        return seen.labelled(estimator.estimate(data)) if seen.whole else seen.estimated(estimator)
     from ballfg.estimation.batch import estimate_tracks
 
     return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, flights=True)}
@@ -370,7 +371,7 @@ def _model(model: Model, source: "Tracks | None") -> "BallModel":
         return (nominal_model if source else ready_nominal)(ball if model is None else model)
     if not isinstance(model, str | PathLike):
         check_model(model, "Load one with load_model, or give its file.")
-        return cast("BallModel", model)
+        return model
     room = None if source is None else source.info.name
     radius = None if source is None else ball.radius  # a track by itself is of the ball that a network knows
     if source is None:

@@ -1,17 +1,21 @@
 """A camera factor compares the pixel of a sighting, and the ball's radius, with the projection of the state."""
 
+from __future__ import annotations
+
 from collections.abc import Hashable
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
+from ballfg.deferred import torch
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 from ballfg.vision.projection import CameraBank
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FIXED = -1
 """The column of a camera whose time offset is not estimated."""

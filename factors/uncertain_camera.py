@@ -1,16 +1,20 @@
 """Camera factors of cameras whose turn, place and focal length are known with a covariance only."""
 
+from __future__ import annotations
+
 from collections.abc import Hashable, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
+from ballfg.deferred import torch
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.vision.camera import Camera
 from ballfg.vision.projection import CHANGES, ZOOM, seen_at, slopes_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class UncertainCameraFactors(CameraFactors):

@@ -91,7 +91,8 @@ def test_what_is_imported_is_what_the_syntax_says() -> None:
         said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules = set(said.stdout.split())
     assert {module for module in modules if module.split(".")[0] == "ballfg"} <= closure(STARTS)
-    assert not modules & {"cv2", "gtsam", "pandas", "scipy.optimize", "scipy.sparse", "scipy.special", "sympy"}
+    unneeded = {"cv2", "gtsam", "pandas", "scipy.optimize", "scipy.sparse", "scipy.special", "sympy", "torch"}
+    assert not modules & unneeded
 
 
 def test_the_online_estimator_needs_nothing_of_scipy() -> None:
@@ -99,7 +100,7 @@ def test_the_online_estimator_needs_nothing_of_scipy() -> None:
     said = fresh("import sys; from ballfg.estimation import Online; print(*sys.modules)", check=True).stdout
     modules = set(said.split())
     assert "ballfg.estimation.online.final" in modules
-    assert not modules & {"gtsam", "scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.special"}
+    assert not modules & {"gtsam", "scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.special", "torch"}
 
 
 if __name__ == "__main__":

@@ -321,8 +321,8 @@ def model_alone(model: Path | None, ball: str | None) -> "tuple[BallModel, Setti
     from ballfg.dynamics.nominal import ready_nominal
     from ballfg.estimation import Settings
 
-    file = ball is not None and Path(ball).is_file()
-    loaded: BallModel = (known := _named(ball)[1] if file else ready_nominal(_known(ball or "table_tennis")))
+    name = ball or "table_tennis"
+    loaded: BallModel = (known := _named(name)[1] if Path(name).is_file() else ready_nominal(_known(name)))
     if model is not None:
         loaded = ready_file(model, radius=None if ball is None else known.radius, inertia_factor=known.inertia_factor)
     settings = Settings.for_measured(loaded)

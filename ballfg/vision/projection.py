@@ -5,19 +5,23 @@ X is seen by the changed camera where the camera as it is sees X' = C + p + p x 
 C; pixels then grow about the principal point by exp(zoom). The turn is of first order in X', exact in `changed`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import check_each
+from ballfg.deferred import torch
 from ballfg.vision.camera import Camera
 
-T = TypeVar("T", Tensor, Array)
+if TYPE_CHECKING:
+    from torch import Tensor
+
+T = TypeVar("T", "Tensor", Array)
 
 
 class CameraBank:

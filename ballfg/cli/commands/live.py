@@ -149,9 +149,10 @@ def _scene(
 
     from ballfg.checks import check_number
     from ballfg.dynamics import Surfaces
-    from ballfg.estimation import dataset_settings, dataset_surfaces
 
     if data is not None:
+        from ballfg.estimation import dataset_settings, dataset_surfaces
+
         ball = inputs.open_model(data, model, named)
         surfaces, settings = dataset_surfaces(data), dataset_settings(data, ball)
     else:

@@ -148,7 +148,7 @@ class KeptModel:
             raise AttributeError(name)
         return getattr(self.whole, name)
 
-    @property
+    @property  # type: ignore[misc]
     def __class__(self) -> type:
         """That of the model for whoever has imported it: it counts as one wherever types are checked."""
         analytic = sys.modules.get("ballfg.dynamics.analytic")
@@ -160,7 +160,8 @@ class KeptModel:
     @cached_property
     def functions(self) -> CompiledModel:
         """Its machine code."""
-        return CompiledModel(*(_function(self._facts[name]) for name in FUNCTIONS), self.radius)
+        rates, impact, surface, rolling = (_function(self._facts[name]) for name in FUNCTIONS)
+        return CompiledModel(rates, impact, surface, rolling, self.radius)
 
     @property
     def in_flight(self) -> KeptModel:

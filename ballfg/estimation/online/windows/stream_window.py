@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.kept_model import carried
 from ballfg.estimation.online.state import Measurement, Sample, prepare
 from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.windows.window_filter import WindowFilter
@@ -87,7 +88,7 @@ class StreamWindow(ABC):
         self.p = model_width(model)
         self._filter = WindowFilter(settings, self.width)
         self._order = np.r_[:STATE_DIM, self.width : self.width + self.p, STATE_DIM : self.width]
-        self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
+        self._own_means = coefficient_means(carried(model)[0], settings)
         self._own_sigmas = np.array(list(settings.coefficients.values()))
         self.first = 0
         self.threshold = np.full(self.width, POSITION_THRESHOLD * position_sigma)
