@@ -150,9 +150,15 @@ class KeptModel:
 
     @property  # type: ignore[misc]
     def __class__(self) -> type:
-        """That of the model for whoever has imported it: it counts as one wherever types are checked."""
-        analytic = sys.modules.get("ballfg.dynamics.analytic")
-        return KeptModel if analytic is None else cast(type, analytic.AnalyticModel)
+        """That of the model for whoever has imported models: it counts as one wherever types are checked."""
+        if "ballfg.dynamics.model" not in sys.modules:
+            return KeptModel
+        from ballfg.dynamics.analytic import AnalyticModel
+
+        return AnalyticModel
+
+    def __repr__(self) -> str:
+        return repr(self.whole)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _again, (self._facts, self._make, {n: float(v) for n, v in self._values.items()}, self.names)
@@ -310,6 +316,6 @@ def keep(about: str, model: BallModel) -> None:
 @cache
 def _key(about: str) -> str:
     folder, own = Path(__file__).parents[1], hashlib.sha256()
-    for file in sorted(folder.rglob("*.py")):
+    for file in sorted((*folder.rglob("*.py"), *folder.rglob("*.yaml"))):  # the known balls are YAML
         own.update(file.read_bytes())
     return f"kept model, {about}, {own.hexdigest()}"
