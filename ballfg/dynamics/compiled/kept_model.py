@@ -11,7 +11,6 @@ import hashlib
 import sys
 import weakref
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from copy import copy
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import check_instance
+from ballfg.checks import check_instance, check_path
 from ballfg.dynamics.coefficient import THIN_SHELL, Coefficient
 from ballfg.dynamics.compiled.build import Code, built, read_note, write_note
 from ballfg.dynamics.compiled.places import NUMBERS, Numbers, numbers_of, stamp_of
@@ -132,14 +131,15 @@ class KeptModel:
     @cached_property
     def whole(self) -> BallModel:
         """The model itself, whose numbers then count."""
-        model = self._make()
         if self.alone is not self:
             from ballfg.dynamics.augmented import AugmentedModel
 
             return AugmentedModel(self.alone.whole, self.names)
         from ballfg.dynamics.model import with_values
 
-        model = with_values(model, {n: float(v) for n, v in self._values.items() if v != self._facts["values"][n]})
+        model = with_values(
+            self._make(), {n: float(v) for n, v in self._values.items() if v != self._facts["values"][n]}
+        )
         NUMBERS[cast("BallModel", self)] = numbers_of(model)
         return model
 
@@ -199,9 +199,9 @@ class KeptModel:
 
     def with_travelling(self, names: tuple[str, ...]) -> KeptModel:
         """The model with some coefficients read from the state."""
-        other = copy(self)
+        other = object.__new__(KeptModel)
+        other.__dict__ |= vars(self) | {"names": names, "alone": self}
         other.__dict__.pop("whole", None)
-        other.names, other.alone = names, self
         return other
 
 
@@ -271,6 +271,7 @@ def ready_file(
     path: Path, *, radius: float | None = None, inertia_factor: float = THIN_SHELL, room: str | None = None
 ) -> BallModel:
     """`load_model` for an estimate, which does not change the model: without torch where its machine code is kept."""
+    path = check_path("path", path)
     make = partial(_loaded, path, radius, inertia_factor, room)
     return ready(partial(about_file, path, radius, inertia_factor), make) if path.is_file() else make()
 
