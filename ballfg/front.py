@@ -291,7 +291,7 @@ def _table_of_positions(measured: object) -> Dataset:
         what = "one Track; effects show in many of them" if isinstance(data, Track) else type_name(data)
         raise TypeError(
             f"measured must be a dataset or its folder; got {what}. Read one with bf.read, or make one of tracks with "
-            "bf.import_tracks or ballfg.tracks.dataset_in_memory."
+            "bf.import_tracks or ballfg.tracks.dataset.dataset_in_memory."
         )
     return data
 

@@ -130,7 +130,7 @@ def check_known(found: "NoiseEstimate", dataset: Path) -> None:
     for field, (meaning, _, _, most) in MEANINGS.items():
         largest = max((number for name, number in numbers.items() if name.split(".")[0] == field), default=0.0)
         if largest > most:
-            absurd.append(f"{meaning.partition(',')[0]} {largest:.2g}")
+            absurd.append(f"{meaning.partition(',')[0].format('a coefficient')} {largest:.2g}")
     if unknown or absurd:
         why = f"it would be: {', '.join(absurd)}" if absurd else f"they allow {found.starts} forecasts only"
         raise ValueError(
