@@ -181,7 +181,7 @@ def test_a_closed_pipe_ends_it_cleanly(dataset: Path) -> None:
         assert process.wait() == 0
     assert "Traceback" not in said
     assert "Exception" not in said
-    assert "balls; " in said
+    assert re.search(r"\d+ positions, \d+ balls?; ", said)  # how many lines it had read is chance
 
 
 def test_a_full_disk_ends_it_with_one_line_and_the_recording_stays(dataset: Path, tmp_path: Path) -> None:
