@@ -290,7 +290,8 @@ def _named(ball: str) -> "tuple[Ball, AnalyticModel]":
 
         kind = ball_kind(ball)
         return kind.ball, kind.model
-    return _known(ball), nominal_model(_known(ball))
+    known = _known(ball)
+    return known, nominal_model(known)
 
 
 def _known(ball: str) -> "Ball":

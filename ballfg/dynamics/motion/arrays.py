@@ -33,11 +33,8 @@ class PreparedMotion:
         """States (n, w) after dt s of free flight, and their Jacobians (n, w, w)."""
         start, durations = plain(start), np.full(len(start), dt)
         if self._moving is None:
-            from ballfg.dynamics.motion.integrate import fly_jacobian
-
-            flown, jacobian = _by_torch(fly_jacobian, self.model, start, durations)
-            return flown, jacobian
-        after, moved, _ = self._moving.at(start).travel(durations, np.empty((len(start), 0)))
+            return fly_jacobian(self.model, start, durations)
+        after, moved, _ = self._moving.at(start).travel(durations, motion.levels(len(start)))
         return after, moved
 
     def bounce(self, start: Array, dt: float, height: float) -> tuple[Array, Array, Array]:
@@ -47,20 +44,15 @@ class PreparedMotion:
         """
         start, durations = plain(start), np.full(len(start), dt)
         if self._moving is None:
-            from ballfg.dynamics.motion.contact import fly_through_jacobian
-
-            after, times, jacobian = _by_torch(fly_through_jacobian, self.model, start, durations, (height,))
-            return after, times[:, 0], jacobian
-        after, moved, times = self._moving.at(start).travel(durations, np.full((len(start), 1), height))
+            after, times, moved = fly_through_jacobian(self.model, start, durations, (height,))
+            return after, times[:, 0], moved
+        after, moved, times = self._moving.at(start).travel(durations, motion.levels(len(start), (height,)))
         return after, times[:, 0], moved
 
     def gaps(self, states: Array, height: float) -> tuple[Array, Array]:
         """(n,) m from a surface (m) up to balls' lowest points, and the derivatives (n, w)."""
         if self._moving is None:
-            from ballfg.dynamics.motion.contact import gap_jacobian
-
-            gaps, slopes = _by_torch(gap_jacobian, self.model, states, height)
-            return gaps, slopes
+            return gap_jacobian(self.model, states, height)
         return self._moving.at(plain(states)).gaps(height)
 
 
@@ -150,35 +142,14 @@ def fly_through_jacobian(
     return after, times, jacobian
 
 
-def roll(model: "BallModel", states: Array, dt: Array, height: Array) -> Array:
-    """States (n, 9 + p) after dt (n,) s on surfaces at heights (n,) m: sliding until the ball rolls, then rolling."""
-    if (moving := _moving(model, states)) is not None:
-        return moving.roll(plain(dt), plain(height))[0]
-    from ballfg.dynamics.motion.rollout import roll as in_torch
-
-    found: Array = _by_torch(in_torch, model, states, dt, height)
-    return found
-
-
 def roll_jacobian(model: "BallModel", states: Array, dt: Array, height: Array) -> tuple[Array, Array]:
-    """As `roll`, and the derivatives (n, 9 + p, 9 + p)."""
+    """States (n, 9 + p) after dt (n,) s on surfaces at heights (n,) m, sliding, then rolling; and their derivatives."""
     if (moving := _moving(model, states, states.shape[1])) is not None:
         return moving.roll(plain(dt), plain(height))
     from ballfg.dynamics.motion.rollout import roll_jacobian as in_torch
 
     after, jacobian = _by_torch(in_torch, model, states, dt, height)
     return after, jacobian
-
-
-def contact_time(model: "BallModel", states: Array, height: Array, longest: Array) -> Array:
-    """(n,) s as `contact.contact_time`, of surfaces at heights (n,) m, within (n,) s; NaN without a contact."""
-    calm = model.in_flight
-    if (moving := _moving(calm, states)) is not None:
-        return moving.meets(plain(height), plain(longest))
-    from ballfg.dynamics.motion.contact import contact_time as in_torch
-
-    found: Array = _by_torch(in_torch, model, states, height, longest)
-    return found
 
 
 @dataclass(frozen=True)
