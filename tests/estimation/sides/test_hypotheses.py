@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from scipy import special
 from scipy.stats import multivariate_normal, norm
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
@@ -15,7 +16,7 @@ from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.motion.arrays import PreparedMotion
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.sides.gaussians import GaussianMixture
+from ballfg.estimation.sides.gaussians import FAR_TAIL, GaussianMixture, _log_share_above
 from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor
 from ballfg.factors.noise import ProcessNoise
@@ -269,3 +270,12 @@ def test_a_side_is_told_as_long_as_the_estimator_takes_the_other() -> None:
         assert told[0] is not None
         assert told[0].bounced
         assert (told[2] is None) == held
+
+
+def test_the_share_above_a_cut_is_that_of_scipy() -> None:
+    cuts = np.concatenate((np.linspace(-35.0, 40.0, 751), [FAR_TAIL - 1e-9, FAR_TAIL + 1e-9, 1e3, 1e150]))
+    found = np.array([_log_share_above(cut) for cut in cuts.tolist()])
+    np.testing.assert_allclose(found, special.log_ndtr(-cuts), rtol=1e-12, atol=0.0)
+    assert _log_share_above(np.inf) == -np.inf
+    assert _log_share_above(-np.inf) == 0.0
+    assert np.isnan(_log_share_above(np.nan))
