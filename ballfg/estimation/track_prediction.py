@@ -7,7 +7,6 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
 from ballfg.checks import as_float
@@ -195,18 +194,18 @@ def _predict_alike(
     ends = [float(clock[n - 1]) for clock, n in zip(clocks, seen, strict=True)]
     times = _padded([clock[n:] for clock, n in zip(clocks, seen, strict=True)], ends)
     belief = Belief.of(estimator.model, [e.last for e in estimates], estimator.settings.coefficients)
-    belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
+    belief = replace(belief, time=np.array(ends))
     positions, velocities = (np.zeros((*times.shape, 3)) for _ in range(2))
     covariances = np.zeros((*times.shape, 3, 3))
     outside: Array | None = None
-    for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
-        velocities[:, k] = predicted.mean[:, VELOCITY].numpy()
-        positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces).numpy()
+    for k, predicted in enumerate(propagator.walk(belief, times) if times.size else ()):
+        velocities[:, k] = predicted.mean[:, VELOCITY]
+        positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces)
         share = out_of_distribution(predicted.model, predicted.mean)
         if share is not None:
             outside = np.zeros(times.shape) if outside is None else outside
             outside[:, k] = share
-        covariances[:, k] = predicted.covariance[:, POSITION, POSITION].numpy()
+        covariances[:, k] = predicted.covariance[:, POSITION, POSITION]
     for i, (track, result, (later, measured, white)) in enumerate(zip(tracks, estimates, parts, strict=True)):
         k = len(later)
         variances = np.diagonal(covariances[i, :k], axis1=1, axis2=2)

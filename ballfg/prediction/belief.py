@@ -9,18 +9,16 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
-from ballfg.deferred import torch
 from ballfg.dynamics.compiled.kept_model import augmented, carried
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.prediction.state import BallState
 from ballfg.state import STATE_DIM
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from ballfg.dynamics.model import BallModel
 
 
@@ -36,9 +34,13 @@ class Belief:
     """
 
     model: BallModel
-    time: Tensor
-    mean: Tensor
-    covariance: Tensor
+    time: Array
+    mean: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        for name in ("time", "mean", "covariance"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))  # also from tensors
 
     @classmethod
     def of(
@@ -73,12 +75,8 @@ class Belief:
         low, high = _bounds(model, names)
         joints = [_joint(state, names, prior_mean, np.array(list(prior.values()))) for state in states]
         mean = np.stack([_held(m, covariance, low, high) for m, covariance in joints])
-        return cls(
-            bounded,
-            torch.tensor([state.time for state in states], dtype=torch.float64),
-            torch.from_numpy(mean),
-            torch.from_numpy(np.stack([covariance for _, covariance in joints])),
-        )
+        times = np.array([state.time for state in states])
+        return cls(bounded, times, mean, np.stack([covariance for _, covariance in joints]))
 
     def within_bounds(self, states: Array) -> Array:
         """Balls whose coefficients lie within the bounds of their effects.
@@ -94,7 +92,7 @@ class Belief:
 
     def from_zero(self) -> Belief:
         """The belief with time counted from now, against the rounding of large stamps."""
-        return replace(self, time=torch.zeros_like(self.time))
+        return replace(self, time=np.zeros_like(self.time))
 
     @staticmethod
     def joined(beliefs: Sequence[Belief]) -> Belief:
@@ -105,17 +103,18 @@ class Belief:
         """
         return Belief(
             beliefs[0].model,
-            torch.cat([belief.time for belief in beliefs]),
-            torch.cat([belief.mean for belief in beliefs]),
-            torch.cat([belief.covariance for belief in beliefs]),
+            np.concatenate([belief.time for belief in beliefs]),
+            np.concatenate([belief.mean for belief in beliefs]),
+            np.concatenate([belief.covariance for belief in beliefs]),
         )
 
-    def take(self, rows: Tensor | slice) -> Belief:
+    def take(self, rows: ArrayLike | slice) -> Belief:
         """A part of the balls.
 
         Args:
             rows: their (m,) indices, a (n,) mask or a slice.
         """
+        rows = rows if isinstance(rows, slice) else np.asarray(rows)
         return replace(self, time=self.time[rows], mean=self.mean[rows], covariance=self.covariance[rows])
 
 

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_number
-from ballfg.deferred import torch
 from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
+from ballfg.dynamics.motion import arrays
 from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
@@ -30,10 +30,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ballfg.dynamics.model import BallModel
-    from ballfg.dynamics.motion.flight_step import RateFunction
 
 EventFunction = Callable[["Tensor"], "Tensor"]
-"""(..., d) states to (..., 1) values; the event is where the value falls through zero."""
+"""(..., d) states to (..., 1) values, in torch; the event is where the value falls through zero."""
+_Event = Callable[[Array], tuple[Array, Array]]
+"""States (k, d) to an event's values (k,) and their gradients (k, d)."""
 SearchStep = Callable[[Belief, float, float], tuple["Crossing | None", Belief]]
 """From a belief, the end of a search and the time (s) from which events count to an event and the belief then."""
 
@@ -97,7 +98,7 @@ def next_contact(
 def plane_crossing(
     propagator: Propagator,
     belief: Belief,
-    normal: ArrayLike | Tensor,
+    normal: ArrayLike,
     offset: float,
     horizon: float = 3.0,
     *,
@@ -131,10 +132,11 @@ def _line_crossing(
     either_way: bool = False,
 ) -> Crossing | None:
     """The next time at which normal . state (9,) falls through an offset; line: both."""
-    normal, offset = torch.from_numpy(line[0]), line[1]
+    gradient, offset = np.zeros(belief.mean.shape[1]), line[1]
+    gradient[:STATE_DIM] = line[0]
 
-    def event(state: Tensor) -> Tensor:
-        return (state[..., :STATE_DIM] * normal).sum(-1, keepdim=True) - offset
+    def event(states: Array) -> tuple[Array, Array]:
+        return states @ gradient - offset, np.tile(gradient, (len(states), 1))
 
     step = partial(_crossing_step, propagator, event, either_way)
     return _first(belief, horizon, after, step, partial(propagator.search, line=line, either_way=either_way))
@@ -160,21 +162,31 @@ def next_crossing(
     Returns: None if there is no crossing within the horizon.
     Raises: ValueError: if the belief does not hold exactly one ball, or the horizon is not a positive number of s.
     """
-    return _first(belief, horizon, after, partial(_crossing_step, propagator, event, either_way))
+    return _first(belief, horizon, after, partial(_crossing_step, propagator, partial(_valued, event), either_way))
+
+
+def _valued(event: EventFunction, states: Array) -> tuple[Array, Array]:
+    """Values (k,) and gradients (k, d) of an event that torch computes, of states (k, d)."""
+    import torch
+
+    from ballfg.dynamics.motion.integrate import batch_jacobian
+
+    values, gradients = batch_jacobian(event, torch.from_numpy(states), outputs=1)
+    return values[:, 0].numpy(), gradients[:, 0].numpy()
 
 
 def _first(
     belief: Belief, horizon: float, after: float, step: SearchStep, search: Search | None = None
 ) -> Crossing | None:
-    """The first event: found by machine code, `search`, where there is any; by a `step` in torch where that ends."""
+    """The first event: found by machine code, `search`, where there is any; by a `step` at a time where that ends."""
     if len(belief) != 1:
         raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
-    end, start = check_number("horizon", horizon, "s", above=0.0), float(belief.time)
+    end, start = check_number("horizon", horizon, "s", above=0.0), float(belief.time[0])
     earliest = max(after - start, 0.0) + JUST_NOW + float(np.spacing(abs(start)))  # as `after` was rounded
     belief = belief.from_zero()
-    while (left := end - float(belief.time)) > 0.0:
+    while (left := end - float(belief.time[0])) > 0.0:
         if search is not None:
-            how, belief, gradient, rate = search(belief, left, earliest - float(belief.time))
+            how, belief, gradient, rate = search(belief, left, earliest - float(belief.time[0]))
             if how == FOUND:
                 return _projected(belief, gradient, rate).later(start)
             if how == NONE:
@@ -189,102 +201,83 @@ def _contact_step(
     propagator: Propagator, belief: Belief, end: float, earliest: float
 ) -> tuple[Crossing | None, Belief]:
     """A contact within one step, and the belief after the step, or after a contact that came too early to count."""
-    model, surfaces = belief.model, propagator.surfaces
-    h = torch.tensor([min(end - float(belief.time), MAX_STEP)], dtype=torch.float64)
-    found = _contact_within(model, belief.mean, h, surfaces)
+    model, h = belief.model, min(end - float(belief.time[0]), MAX_STEP)
+    found = _contact_within(model, belief.mean, h, propagator.surfaces)
     if found is not None:
         tau, height = found
-        there = propagator.in_flight(belief, tau)
-        if float(there.time) > earliest:
-            return _at_event(there, lambda state: model.gap(state, height).unsqueeze(-1), model.rates), there
+        there = propagator.in_flight(belief, np.array([tau]))
+        if float(there.time[0]) > earliest:
+            return _at_event(there, arrays.gap_jacobian(model, there.mean, height)[1][0], rolls=False), there
         h = tau + JUST_NOW  # a small hop may be over within the step
-    return None, propagator.forward(belief, h)
+    return None, propagator.forward(belief, np.array([h]))
 
 
 def _crossing_step(
-    propagator: Propagator, event: EventFunction, either_way: bool, belief: Belief, end: float, earliest: float
+    propagator: Propagator, event: _Event, either_way: bool, belief: Belief, end: float, earliest: float
 ) -> tuple[Crossing | None, Belief]:
     """A crossing within one step, and the belief after the step."""
-    h = torch.tensor([min(end - float(belief.time), MAX_STEP - JUST_NOW)], dtype=torch.float64)
+    start = float(belief.time[0])
+    h = min(end - start, MAX_STEP - JUST_NOW)
     for tau in _crossings(propagator, belief, event, h + JUST_NOW, either_way):  # no gap between steps
-        if float(belief.time) + tau > earliest:
-            there = propagator.forward(belief, torch.tensor([tau], dtype=torch.float64))
-            return _at_event(there, event, _rates(propagator, there)), there
-    return None, propagator.forward(belief, h)
+        if start + tau > earliest:
+            there = propagator.forward(belief, np.array([tau]))
+            return _at_event(there, event(there.mean)[1][0], rolls=_rolls(propagator, there)), there
+    return None, propagator.forward(belief, np.array([h]))
 
 
-def _contact_within(model: BallModel, mean: Tensor, h: Tensor, surfaces: Surfaces) -> tuple[Tensor, float] | None:
-    """Time (1,) s until a falling ball meets a surface in a step, and that surface's height; None if it does not."""
-    from ballfg.dynamics.motion.contact import contact_time
-    from ballfg.dynamics.motion.integrate import fly
-    from ballfg.dynamics.motion.rollout import is_resting
-
-    with torch.no_grad():
-        after = fly(model, mean, h)
-        for height in surfaces.heights():
-            falls = float(model.gap(after, height)) < 0.0 and float(after[0, VZ]) < 0.0
-            if not falls or bool(is_resting(model, mean, height)):
-                continue
-            tau = contact_time(model, mean, height)
-            if float(tau) >= -JUST_NOW and _lies_under(surfaces, fly(model, mean, tau), height):
-                return tau.clamp_min(0.0), height
+def _contact_within(model: BallModel, mean: Array, h: float, surfaces: Surfaces) -> tuple[float, float] | None:
+    """Time (s) until a falling ball (1, d) meets a surface in a step, and that surface's height; None without one."""
+    after = arrays.fly(model, mean, np.array([h]))
+    for height in surfaces.heights():
+        falls = arrays.gaps(model, after, height)[0] < 0.0 and after[0, VZ] < 0.0
+        if not falls or arrays.is_resting(model, mean, height)[0]:
+            continue
+        tau = arrays.contact_times(model, mean, height)
+        if tau[0] >= -JUST_NOW and _lies_under(surfaces, arrays.fly(model, mean, tau), height):
+            return max(float(tau[0]), 0.0), height
     return None
 
 
-def _lies_under(surfaces: Surfaces, state: Tensor, height: float) -> bool:
-    return height != surfaces.table_height or bool(surfaces.over_table(state))
+def _lies_under(surfaces: Surfaces, state: Array, height: float) -> bool:
+    return height != surfaces.table_height or bool(surfaces.over_table(state)[0])
 
 
-def _crossings(
-    propagator: Propagator, belief: Belief, event: EventFunction, h: Tensor, either_way: bool
-) -> Iterator[float]:
-    """Times (s from the belief's) at which the value goes through zero within a step h (1,)."""
-    looks = torch.linspace(0.0, 1.0, LOOKS + 1, dtype=torch.float64)
+def _crossings(propagator: Propagator, belief: Belief, event: _Event, h: float, either_way: bool) -> Iterator[float]:
+    """Times (s from the belief's) at which the value goes through zero within a step of h s."""
+    looks = np.linspace(0.0, 1.0, LOOKS + 1)
 
-    def changes(low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor, float]]:
+    def changes(low: float, high: float) -> Iterator[tuple[float, float, float]]:
         """Brackets of the sign changes between two times, and the value's size at the end of each."""
         times = low + (high - low) * looks
-        values = event(_mean_at(belief, times, propagator.surfaces))[:, 0]
+        values, _ = event(_mean_at(belief, times, propagator.surfaces))
         falls = (values[:-1] > 0) & (values[1:] <= 0)
         rises = (values[:-1] < 0) & (values[1:] >= 0)
-        for i in (falls | rises if either_way else falls).nonzero()[:, 0].tolist():
-            yield times[i], times[i + 1], float(values[i + 1].abs())
+        for i in np.flatnonzero(falls | rises if either_way else falls).tolist():
+            yield float(times[i]), float(times[i + 1]), abs(float(values[i + 1]))
 
-    for low, high, size in changes(torch.zeros_like(h), h):
-        while float(high - low) > TIME_TOLERANCE:
+    for low, high, size in changes(0.0, h):
+        while high - low > TIME_TOLERANCE:
             low, high, size = next(changes(low, high))
         if size < VALUE_JUMP:
-            yield float(high)
+            yield high
 
 
-def _mean_at(belief: Belief, times: Tensor, surfaces: Surfaces) -> Tensor:
+def _mean_at(belief: Belief, times: Array, surfaces: Surfaces) -> Array:
     """(k, d) means of one ball at times (k,) s from the belief's, all within one step."""
-    from ballfg.dynamics.motion.rollout import advance
-
-    with torch.no_grad():
-        later = advance(belief.model, belief.mean.expand(len(times), -1), times, surfaces)
-        return torch.where((times > 0.0).unsqueeze(-1), later, belief.mean)  # a ball at a contact has not bounced yet
+    starts = belief.mean.repeat(len(times), axis=0)
+    later = arrays.roll_out(belief.model, starts, times[:, None], surfaces)[:, 0]
+    return np.where(times[:, None] > 0.0, later, starts)  # a ball at a contact has not bounced yet
 
 
-def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
-    """Rate of change of the state by air and weight or, at rest, friction."""
-    from ballfg.dynamics.motion.rollout import is_resting
-
-    with torch.no_grad():
-        level = propagator.surfaces.level_below(belief.mean, belief.model.surface_offset(belief.mean))
-        resting = bool(is_resting(belief.model, belief.mean, level))
-    resting = resting and _lies_under(propagator.surfaces, belief.mean, float(level))
-    return belief.model.roll if resting else belief.model.rates
+def _rolls(propagator: Propagator, belief: Belief) -> bool:
+    """Whether friction changes the state, of a ball at rest; else air and weight do."""
+    model, mean, surfaces = belief.model, belief.mean, propagator.surfaces
+    level = surfaces.level_below(mean, arrays.surface_offsets(model, mean))
+    return bool(arrays.is_resting(model, mean, level)[0]) and _lies_under(surfaces, mean, float(level[0]))
 
 
-def _at_event(there: Belief, event: EventFunction, rates: RateFunction) -> Crossing:
-    from ballfg.dynamics.motion.flight_step import derivative
-    from ballfg.dynamics.motion.integrate import batch_jacobian
-
-    _, gradient = batch_jacobian(event, there.mean, outputs=1)
-    with torch.no_grad():
-        rate = derivative(rates, there.mean)
-    return _projected(there, gradient[0, 0].numpy(), rate[0].numpy())
+def _at_event(there: Belief, gradient: Array, *, rolls: bool) -> Crossing:
+    return _projected(there, gradient, arrays.motion_rates(there.model, there.mean, rolls=rolls)[0])
 
 
 def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
@@ -295,7 +288,7 @@ def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
 
     Args: gradient: (d,) of the event.  rate: (d,) of the state.
     """
-    mean, covariance, closing = there.mean[0].detach().numpy(), there.covariance[0].detach().numpy(), gradient @ rate
+    mean, covariance, closing = there.mean[0], there.covariance[0], gradient @ rate
     time_sigma = math.inf
     if closing != 0.0:
         time_by_state = -gradient / closing
@@ -304,4 +297,4 @@ def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
         covariance = projection @ covariance @ projection.T
         covariance = (covariance + covariance.T) / 2
     state, spread = mean[:STATE_DIM].copy(), covariance[:STATE_DIM, :STATE_DIM].copy()
-    return Crossing(float(there.time), time_sigma, state, spread)
+    return Crossing(float(there.time[0]), time_sigma, state, spread)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.deferred import torch
 from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
+from ballfg.dynamics.motion.arrays import bounced, is_resting, place_on, surface_offsets
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief, normal_points, root_of
@@ -129,21 +129,20 @@ def _other_contact(path: "Path", found: Crossing | None) -> tuple[float, Crossin
 
     The share follows from the variance of the vertical speed that the doubt gives and the jump of that speed.
     """
-    with torch.no_grad():
-        start, belief = path.start, path.carried[1]
-        variance = 0.0 if start.other_side is None else float(start.other_side[VZ, VZ])
-        rises, before = float(start.state[VZ]) > 0.0, belief.mean.clone()
-        if variance <= 0.0 or (found is None and not rises):
-            return 0.0, None
-        if found is not None and not rises:
-            before[0, :STATE_DIM] = torch.from_numpy(found.state)
-            other = path.contact(found.time)
-        else:
-            before[0, VZ] *= -1.0  # had it come down as fast as it rises, it would rise more slowly, by the restitution
-            before[0, VZ] = -(before[0, VZ] ** 2) / belief.model.after_bounce(before)[0, VZ]
-            other = Crossing(start.time, 0.0, before[0, :STATE_DIM].numpy(), start.covariance)
-        jump = float(belief.model.after_bounce(before)[0, VZ] - before[0, VZ])
-        return min(variance / jump**2, MOST), other
+    start, (_, belief) = path.start, path.carried
+    variance = 0.0 if start.other_side is None else float(start.other_side[VZ, VZ])
+    rises, before = float(start.state[VZ]) > 0.0, belief.mean.copy()
+    if variance <= 0.0 or (found is None and not rises):
+        return 0.0, None
+    if found is not None and not rises:
+        before[0, :STATE_DIM] = found.state
+        other = path.contact(found.time)
+    else:
+        before[0, VZ] *= -1.0  # had it come down as fast as it rises, it would rise more slowly, by the restitution
+        before[0, VZ] = -(before[0, VZ] ** 2) / bounced(belief.model, before)[0, VZ]
+        other = Crossing(start.time, 0.0, before[0, :STATE_DIM].copy(), start.covariance)
+    jump = float(bounced(belief.model, before)[0, VZ] - before[0, VZ])
+    return min(variance / jump**2, MOST), other
 
 
 def _chance_of(path: "Path", plane: Plane) -> float:
@@ -177,16 +176,13 @@ def event_numbers(found: Crossing | None) -> dict[str, float]:
 
 def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
     """States and coefficients (n, 9 + p) at some errors; if the mean lies on a surface, so do all."""
-    from ballfg.dynamics.motion.rollout import is_resting, place_on
-
-    with torch.no_grad():
-        mean, model = belief.mean, belief.model
-        start = mean + torch.from_numpy(errors)
-        if abs(float(mean[0, VZ])) <= REST_SPEED:
-            level = surfaces.level_below(mean, model.surface_offset(mean))
-            if bool(is_resting(model, mean, level)):
-                start = place_on(model, start, level)
-        return belief.within_bounds(start.numpy())
+    mean, model = belief.mean, belief.model
+    start = mean + errors
+    if abs(float(mean[0, VZ])) <= REST_SPEED:
+        level = surfaces.level_below(mean, surface_offsets(model, mean))
+        if is_resting(model, mean, level)[0]:
+            start = place_on(model, start, float(level[0]))
+    return belief.within_bounds(start)
 
 
 @dataclass(frozen=True)
@@ -210,7 +206,7 @@ class Path:
         kicks, sides, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
         pushes = pushed.reshape(2 * pairs, SPANS, 3)[:, : len(lasting)] * (noise[0] / np.sqrt(h * lasting))[:, None]
         off = sides * surfaces.edge_sigmas if any(surfaces.edge_sigmas) else np.zeros_like(sides)
-        start = _placed(belief, normal_points(pairs, d) @ root_of(belief.covariance[0].detach().numpy()).T, surfaces)
+        start = _placed(belief, normal_points(pairs, d) @ root_of(belief.covariance[0]).T, surfaces)
         chance = (pushes[:, spans], kicks * noise[[3, 3, 2]], off)
         return Scattered.of(belief.model, start, h, chance, surfaces)
 
@@ -261,7 +257,7 @@ class Path:
     def _just_now(self, line: Array, offset: float) -> bool:
         """Whether some balls may be on the other side of an event than the mean at the start."""
         belief, own = self.carried[1], slice(STATE_DIM)  # without the other side of a contact
-        variance = line @ belief.covariance[0, own, own].detach().numpy() @ line
+        variance = line @ belief.covariance[0, own, own] @ line
         return bool(abs(line @ self.start.state - offset) < FAR * math.sqrt(max(variance, 0.0)))
 
     def _near_a_bounce(self, found: Crossing, line: Array) -> bool:

@@ -8,7 +8,7 @@ Near a contact of uncertain time the reported mean and covariance include the ba
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
-from ballfg.deferred import torch
 from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, density_of
 from ballfg.dynamics.compiled.beliefs.edges import share_over_table
 from ballfg.dynamics.compiled.motion import world_of
+from ballfg.dynamics.motion import arrays
 from ballfg.dynamics.motion.arrays import advance_jacobian
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, NEGLIGIBLE, steps_over_each
 from ballfg.dynamics.surfaces import Surfaces
@@ -29,7 +29,6 @@ from ballfg.state import POSITION, STATE_DIM, VZ
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from torch import Tensor
 
     from ballfg.dynamics.model import BallModel
 
@@ -77,7 +76,7 @@ class Propagator:
     surfaces: Surfaces
     noise: ProcessNoise
 
-    def rollout(self, belief: Belief, times: ArrayLike | Tensor) -> Prediction:
+    def rollout(self, belief: Belief, times: ArrayLike) -> Prediction:
         """The states at given times.
 
         Args:
@@ -85,15 +84,15 @@ class Propagator:
             times: (n, k) s on each ball's clock, or (k,) for all; not decreasing, not before the belief.
         Raises: ValueError: if the shape is another, or a time lies before the one before it.
         """
-        stamps = torch.as_tensor(times, dtype=torch.float64)
-        if stamps.dim() == 1:
-            stamps = stamps.expand(len(belief), -1)
+        stamps = np.asarray(times, dtype=np.float64)
+        if stamps.ndim == 1:
+            stamps = np.tile(stamps, (len(belief), 1))
         course = Course.joined([part for part, _ in self._mixed(belief, stamps)])
         states = course.mean[:, :, :STATE_DIM].swapaxes(0, 1).copy()
         covariances = course.covariance[:, :, :STATE_DIM, :STATE_DIM].swapaxes(0, 1).copy()
-        return Prediction(stamps.numpy().copy(), states, covariances)
+        return Prediction(stamps.copy(), states, covariances)
 
-    def walk(self, belief: Belief, times: Tensor) -> Iterator[Belief]:
+    def walk(self, belief: Belief, times: ArrayLike) -> Iterator[Belief]:
         """The beliefs at given times (n, k) s, one after the other.
 
         Near a contact of uncertain time a belief is the mean and covariance of the balls on both sides of it. Start a
@@ -101,15 +100,15 @@ class Propagator:
 
         Raises: ValueError: as `rollout`.
         """
-        for part, elapsed in self._mixed(belief, times):
+        for part, elapsed in self._mixed(belief, np.asarray(times, dtype=np.float64)):
             yield from _beliefs(belief, part, elapsed)
 
-    def forward(self, belief: Belief, dt: Tensor) -> Belief:
+    def forward(self, belief: Belief, dt: ArrayLike) -> Belief:
         """The belief after dt (n,) s, on the mean's side of every contact.
 
         Raises: ValueError: if a dt is negative, infinite or not a number.
         """
-        ((part, elapsed),) = self._over(self._carrier(belief), belief, dt[:, None])
+        ((part, elapsed),) = self._over(self._carrier(belief), belief, np.asarray(dt, dtype=np.float64)[:, None])
         return next(_beliefs(belief, part, elapsed))
 
     def search(
@@ -132,35 +131,34 @@ class Propagator:
         Returns: `events.NONE`, `FOUND`, or `HARD` before a landing, several bounces, or a bounce at a table's edge; the
             belief there, (9 + p,) the event's gradient, and (9 + p,) 1/s, the state's rate of change.
         """
-        start = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy())
+        start = Course.start(belief.mean, belief.covariance)
         carrier = self._carrier(belief)
         end, elapsed, course, rate = carrier.find(start, horizon, earliest, line, either_way=either_way)
-        (there,) = _beliefs(belief, course, torch.tensor([[elapsed]], dtype=torch.float64))
+        (there,) = _beliefs(belief, course, np.array([[elapsed]]))
         return end, there, carrier.gradient(course.mean[-1, 0], line), rate
 
     def _carrier(self, belief: Belief) -> Carrier:
-        return Carrier(belief.model, belief.mean.detach().numpy(), self.surfaces, density_of(self.noise))
+        return Carrier(belief.model, belief.mean, self.surfaces, density_of(self.noise))
 
-    def _mixed(self, belief: Belief, times: Tensor) -> Iterator[tuple[Course, Tensor]]:
+    def _mixed(self, belief: Belief, times: Array) -> Iterator[tuple[Course, Array]]:
         """Beliefs at given times (n, k) s, mixed near contacts, a few at a time, with the elapsed time."""
-        if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
-            raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
-        durations = torch.diff(times, dim=-1, prepend=belief.time[:, None])
-        if not bool((durations >= 0).all()):
+        if times.ndim != 2 or len(times) != len(belief) or times.shape[1] == 0:
+            raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {times.shape}")
+        durations = np.diff(times, prepend=belief.time[:, None])
+        if not (durations >= 0.0).all():
             raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
         carrier = self._carrier(belief)
         for part, elapsed in self._over(carrier, belief, durations):
             yield carrier.mixed(part), elapsed
 
-    def _over(self, carrier: Carrier, belief: Belief, durations: Tensor) -> Iterator[tuple[Course, Tensor]]:
+    def _over(self, carrier: Carrier, belief: Belief, given: Array) -> Iterator[tuple[Course, Array]]:
         """Linear beliefs after some durations (n, k) s, a few at a time, with the elapsed time (n, j) s."""
-        given = durations.numpy()
         if not ((given >= 0.0) & np.isfinite(given)).all():
             raise ValueError(f"dt must be finite and not negative; got {given.min():g} to {given.max():g} s")
         moving = np.minimum(given, LONGEST_MOTION)
-        staying, elapsed = given - moving, durations.cumsum(1)
-        course, first = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy()), 0
-        for last in sorted({*np.flatnonzero((staying > 0.0).any(0)).tolist(), durations.shape[1] - 1}):
+        staying, elapsed = given - moving, given.cumsum(axis=1)
+        course, first = Course.start(belief.mean, belief.covariance), 0
+        for last in sorted({*np.flatnonzero((staying > 0.0).any(0)).tolist(), given.shape[1] - 1}):
             part = moving[:, first : last + 1]
             counts = steps_over_each(part.max(0))
             steps, ends = np.repeat(part / counts, counts, axis=1), counts.cumsum()
@@ -185,96 +183,84 @@ class Propagator:
         course, hard = carrier.carry(start, h)
         rows, k = hard.nonzero()[0], len(course) - 1
         for r in rows:
-            before = (array[k - 1, r : r + 1].copy() for array in (course.mean, course.covariance))
-            mean, covariance = map(torch.from_numpy, before)
-            touched, height = self._touch(model, mean, covariance, float(h[r, k - 1]))
-            course.mean[k, r], course.covariance[k, r] = touched
+            before = course.mean[k - 1, r].copy(), course.covariance[k - 1, r].copy()
+            course.mean[k, r], course.covariance[k, r], height = self._touch(model, *before, float(h[r, k - 1]))
             course.level[k, r], course.age[k, r] = height, 0.0 if np.isfinite(height) else np.nan
         return course.at(slice(1, None))
 
-    def _touch(self, model: BallModel, mean: Tensor, covariance: Tensor, h: float) -> tuple[tuple[Array, Array], float]:
-        """Mean and covariance after a step of h s of a ball (1, d) that reaches a surface's level.
+    def _touch(self, model: BallModel, mean: Array, covariance: Array, h: float) -> tuple[Array, Array, float]:
+        """Mean (d,) and covariance (d, d) after a step of h s of a ball that reaches a surface's level.
 
         It also returns the height (m) of the surface of a single bounce, else NaN.
         """
-        dt = torch.tensor([h], dtype=torch.float64)
-        motion = advance_jacobian(model, mean[0].numpy(), h, self.surfaces)
-        jacobian = torch.from_numpy(motion.jacobian)
-        noise = torch.from_numpy(self.noise.flight(dt.numpy()))
+        motion = advance_jacobian(model, mean, h, self.surfaces)
+        noise = self._flight_noise(h)
         if motion.contacts:
-            times = mean.new_tensor([[time for time, _ in motion.contacts]])
-            noise = self._bounce_noise(model, mean, dt, times, jacobian[None])
-        noise = noise + _edge_doubt(model, mean, covariance, dt, self.surfaces)
-        spread = _carried(jacobian, covariance, noise)
+            noise = self._bounce_noise(model, mean, h, [time for time, _ in motion.contacts], motion.jacobian)
+        noise = noise + _edge_doubt(model, mean, covariance, h, self.surfaces)
         height = motion.contacts[0][1] if len(motion.contacts) == 1 else math.nan
-        return (motion.after, spread[0].numpy()), height
+        return motion.after, _carried(motion.jacobian, covariance, noise), height
 
-    def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
+    def in_flight(self, belief: Belief, dt: Array) -> Belief:
         """The belief after dt (n,) s of free flight, without surfaces."""
-        from ballfg.dynamics.motion.integrate import fly_jacobian
+        after, jacobian = arrays.fly_jacobian(belief.model, belief.mean, dt)
+        covariance = _carried(jacobian, belief.covariance, self.noise.flight(dt))
+        return replace(belief, time=belief.time + dt, mean=after, covariance=covariance)
 
-        after, jacobian = fly_jacobian(belief.model, belief.mean, dt)
-        noise = torch.from_numpy(self.noise.flight(dt.numpy()))
-        return replace(
-            belief, time=belief.time + dt, mean=after, covariance=_carried(jacobian, belief.covariance, noise)
-        )
-
-    def _bounce_noise(self, model: BallModel, mean: Tensor, h: Tensor, times: Tensor, jacobian: Tensor) -> Tensor:
-        """(n, 9, 9) covariance gathered in a step with impacts at times (n, k).
+    def _bounce_noise(self, model: BallModel, mean: Array, h: float, times: Sequence[float], jacobian: Array) -> Array:
+        """(9, 9) covariance gathered in a step of h s with impacts at some times, s.
 
         The flight's noise before the first impact goes through it; each impact adds its own.
         """
-        from ballfg.dynamics.motion.integrate import fly_jacobian
+        first = min(max(times[0], 0.0), h)
+        _, flight = arrays.fly_jacobian(model, mean[None], np.array([first]))
+        onward = np.linalg.solve(flight[0].T, jacobian.T).T[:STATE_DIM, :STATE_DIM]  # from the impact to the end
+        noise = onward @ self._flight_noise(first) @ onward.T + self._flight_noise(h - first)
+        for time in times:
+            noise += self.noise.contact(np.array([h]), np.array([time]))[0]
+        return np.asarray(noise)
 
-        first = times[:, 0].clamp(torch.zeros_like(h), h)
-        _, flight = fly_jacobian(model, mean, first)
-        onward = torch.linalg.solve(flight.mT, jacobian.mT).mT[:, :STATE_DIM, :STATE_DIM]  # from the impact to the end
-        before = torch.from_numpy(self.noise.flight(first.numpy()))
-        noise = onward @ before @ onward.mT + torch.from_numpy(self.noise.flight((h - first).numpy()))
-        for time in times.unbind(-1):
-            noise += torch.from_numpy(self.noise.contact(h.numpy(), time.numpy()))
-        return noise
+    def _flight_noise(self, dt: float) -> Array:
+        """(9, 9) covariance gathered in dt s of free flight."""
+        return self.noise.flight(np.array([dt]))[0]
 
 
-def _beliefs(start: Belief, course: Course, elapsed: Tensor) -> Iterator[Belief]:
+def _beliefs(start: Belief, course: Course, elapsed: Array) -> Iterator[Belief]:
     """The beliefs of a course, each after the time (n, k) s since the start in one column."""
     for k in range(len(course)):
-        mean, covariance = torch.from_numpy(course.mean[k]), torch.from_numpy(course.covariance[k])
-        yield Belief(start.model, start.time + elapsed[:, k], mean, covariance)
+        yield Belief(start.model, start.time + elapsed[:, k], course.mean[k], course.covariance[k])
 
 
-def _carried(jacobian: Tensor, covariance: Tensor, noise: Tensor) -> Tensor:
-    after = jacobian @ covariance @ jacobian.transpose(-1, -2)
-    after[:, :STATE_DIM, :STATE_DIM] += noise
-    return (after + after.transpose(-1, -2)) / 2  # rounding would add up
+def _carried(jacobian: Array, covariance: Array, noise: Array) -> Array:
+    after = jacobian @ covariance @ jacobian.swapaxes(-1, -2)
+    after[..., :STATE_DIM, :STATE_DIM] += noise
+    return np.asarray((after + after.swapaxes(-1, -2)) / 2)  # rounding would add up
 
 
-def _edge_doubt(model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor | float:
+def _edge_doubt(model: BallModel, mean: Array, covariance: Array, h: float, surfaces: Surfaces) -> Array | float:
     """Covariance at the end of a step from the balls that take the other way than the mean.
 
     Near the edge of a table one ball bounces and its neighbour within the uncertainty falls past. The mean takes one of
     the two ways; the covariance gets the second moment, about the mean, of the share that takes the other.
 
     Args:
-        mean: (1, d) state at the start of the step.  covariance: (1, d, d) of it.
-        h: (1,) s, the step; at most one contact with the table.
+        mean: (d,) state at the start of the step.  covariance: (d, d) of it.
+        h: s, the step; at most one contact with the table.
     Returns: (9, 9); 0 if the ball does not come down to the table's level in the step, or far from every edge.
     """
-    from ballfg.dynamics.motion.contact import contact_time
-    from ballfg.dynamics.motion.integrate import fly
-    from ballfg.dynamics.motion.rollout import advance
-
-    with torch.no_grad():
-        height = mean.new_tensor([surfaces.table_height])
-        beside = fly(model, mean, h)
-        if surfaces.extent is None or not float(model.gap(mean, height)) >= 0.0 > float(model.gap(beside, height)):
-            return 0.0
-        touch = fly(model, mean, contact_time(model, mean, height))
-        if not float(touch[0, VZ]) < 0.0:
-            return 0.0
-        over = share_over_table(touch[0].numpy(), covariance[0].numpy(), world_of(surfaces, model.radius))
-        other = 1.0 - over if bool(surfaces.over_table(touch)) else over
-        if other < NEGLIGIBLE:
-            return 0.0
-        difference = (advance(model, mean, h, replace(surfaces, extent=None)) - beside)[0, :STATE_DIM]
-        return other * torch.outer(difference, difference)
+    start, dt, height = mean[None], np.array([h]), surfaces.table_height
+    if surfaces.extent is None:
+        return 0.0
+    beside = arrays.fly(model, start, dt)
+    if not arrays.gaps(model, start, height)[0] >= 0.0 > arrays.gaps(model, beside, height)[0]:
+        return 0.0
+    touch = arrays.fly(model, start, arrays.contact_times(model, start, height))[0]
+    if not touch[VZ] < 0.0:
+        return 0.0
+    over = share_over_table(touch, covariance, world_of(surfaces, model.radius))
+    other = 1.0 - over if bool(surfaces.over_table(touch)) else over
+    if other < NEGLIGIBLE:
+        return 0.0
+    bounced = arrays.roll_out(model, start, dt[:, None], replace(surfaces, extent=None))[0, 0]
+    difference = (bounced - beside[0])[:STATE_DIM]
+    return np.asarray(other * np.outer(difference, difference))

@@ -173,7 +173,7 @@ def _time_model(watch: Stopwatch, name: str, model: BallModel, track: Track) -> 
     for solver, metric in ONLINE.items():
         _time_online(watch, name, metric, Online(model, NO_SURFACE, replace(settings, solver=solver)), track)
     propagator = Propagator(smoother.surfaces, settings.process)
-    times = torch.from_numpy(track.times[-1] + np.arange(1, round(HORIZON * RATE) + 1) / RATE)[None]
+    times = track.times[-1] + np.arange(1, round(HORIZON * RATE) + 1) / RATE
     belief = Belief.of(model, [smoother.estimate(track).last])
     watch.time(name, "prediction_time", lambda: propagator.rollout(belief, times))
 

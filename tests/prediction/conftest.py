@@ -88,7 +88,7 @@ def samples() -> Callable[[Belief, int], Tensor]:
 
     def draw(belief: Belief, count: int) -> Tensor:
         rng = torch.Generator().manual_seed(7)
-        root = torch.linalg.cholesky(belief.covariance[0])
-        return belief.mean + torch.randn((count, belief.mean.shape[-1]), generator=rng, dtype=torch.float64) @ root.T
+        mean, root = torch.from_numpy(belief.mean), torch.linalg.cholesky(torch.from_numpy(belief.covariance[0]))
+        return mean + torch.randn((count, mean.shape[-1]), generator=rng, dtype=torch.float64) @ root.T
 
     return draw

@@ -162,15 +162,15 @@ def test_predictions(in_c: InC) -> None:
     propagator, whole = Propagator(SURFACES, NOISE), 0
     for state, covariance in shots(60):
         done, means, spreads = in_c.predict(state, covariance, TIMES)
-        belief = Belief(in_c.model, torch.zeros(1).double(), torch.tensor(state[None]), torch.tensor(covariance[None]))
+        belief = Belief(in_c.model, np.zeros(1), state[None], covariance[None])
         right = propagator.rollout(belief, TIMES)
         close(means, right.states[0, :done])
         close(spreads, right.covariances[0, :done])
         whole += done == len(TIMES)
     assert whole > 40  # others bounce at an edge of the table
-    belief = Belief(in_c.model, torch.zeros(1).double(), on_table(in_c.model), torch.tensor(covariance[None]))
+    belief = Belief(in_c.model, np.zeros(1), on_table(in_c.model).numpy(), covariance[None])
     right = propagator.rollout(belief, TIMES)
-    done, means, spreads = in_c.predict(belief.mean[0].numpy(), covariance, TIMES)
+    done, means, spreads = in_c.predict(belief.mean[0], covariance, TIMES)
     assert done == len(TIMES)
     close(means, right.states[0])
     close(spreads, right.covariances[0])
@@ -182,7 +182,7 @@ def test_crossings(in_c: InC, way: int, direction: str) -> None:
     for k, (state, covariance) in enumerate(shots(40)):
         normal, offset = np.array([2.0, 0.0, 0.0] if k % 2 else [0.3, 0.0, -1.0]), 1.5 if k % 2 else -0.2
         end, (time, sigma, there, spread) = in_c.cross(state, covariance, normal, offset, way)
-        belief = Belief(in_c.model, torch.zeros(1).double(), torch.tensor(state[None]), torch.tensor(covariance[None]))
+        belief = Belief(in_c.model, np.zeros(1), state[None], covariance[None])
         right = plane_crossing(propagator, belief, normal, offset, 1.0, direction=direction)
         ends.append(end)
         if end == 0:

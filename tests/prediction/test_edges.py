@@ -85,10 +85,8 @@ STEPS = {
 def test_a_step_of_machine_code_is_that_of_torch(uncertain, beliefs, start):
     propagator, h = Propagator(with_end(1.0 if start[0] != 0.9 else 0.935, 0.01), NOISY), 0.02
     belief = beliefs(uncertain, start)
-    course, hard = propagator._carrier(belief).carry(
-        Course.start(belief.mean.numpy(), belief.covariance.numpy()), np.array([[h]])
-    )
-    (mean, covariance), _ = propagator._touch(uncertain, belief.mean, belief.covariance, h)
+    course, hard = propagator._carrier(belief).carry(Course.start(belief.mean, belief.covariance), np.array([[h]]))
+    mean, covariance, _ = propagator._touch(uncertain, belief.mean[0], belief.covariance[0], h)
     assert not hard.any()
     np.testing.assert_allclose(course.mean[1, 0], mean, rtol=0, atol=1e-9)
     sigmas = np.sqrt(np.diagonal(covariance))
@@ -108,7 +106,7 @@ def test_a_ball_that_has_touched_the_table_rises_to_its_apex(uncertain, beliefs)
 
 def test_known_places_at_a_known_edge_have_no_doubt(model, beliefs):
     belief = beliefs(model, START)
-    belief = replace(belief, covariance=torch.zeros_like(belief.covariance))
+    belief = replace(belief, covariance=np.zeros_like(belief.covariance))
     for beyond in (-0.01, 0.01):
         predicted = Propagator(with_end(LANDS + beyond), NEARLY_EXACT).rollout(belief, TIMES)
         assert np.abs(predicted.covariances).max() < 1e-12
@@ -129,11 +127,11 @@ def test_the_spread_of_both_ways_is_that_of_the_states(uncertain, beliefs):
     carrier = propagator._carrier(belief)
     covariance, spread, after, touch = np.zeros((18, 18)), np.zeros((18, 18)), np.ones(18), np.empty(9)
     covariance[:9, :9] = belief.covariance[0, :9, :9]
-    start = belief.mean[0, :9].numpy().copy()
+    start, mean = belief.mean[0, :9].copy(), torch.from_numpy(belief.mean)
     with torch.no_grad():
         end = torch.tensor([h], dtype=torch.float64)
-        after[:9] = fly(uncertain, belief.mean, end)[0, :9]
-        bounced = rollout(uncertain, belief.mean, end, Surfaces(0.0))[0, 0, :9].numpy()
+        after[:9] = fly(uncertain, mean, end)[0, :9]
+        bounced = rollout(uncertain, mean, end, Surfaces(0.0))[0, 0, :9].numpy()
     _, past = both_ways(*carrier._given, start, carrier._world, touch, covariance, h, after, spread)
     assert past
     assert not spread[9:].any()

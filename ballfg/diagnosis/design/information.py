@@ -68,7 +68,7 @@ def planned_flights(
         paths = rollout(model, torch.from_numpy(starts), torch.from_numpy(times), surfaces)
         heights = surfaces.level_below(paths, model.surface_offset(paths))
         gaps, labels = model.gap(paths, heights).numpy(), model.labelled(paths[:, 0, SPIN]).numpy()
-    measured = measured_positions(model, paths.flatten(0, 1), surfaces).numpy().reshape(n, k, 3)
+    measured = measured_positions(model, paths.flatten(0, 1).numpy(), surfaces).reshape(n, k, 3)
     lengths, contacts, levels = np.zeros(n, dtype=np.int64), *(np.full((n, MOST_CONTACTS), np.nan) for _ in range(2))
     for i, path in enumerate(paths.numpy()):
         lengths[i], met = _seen(path, measured[i], gaps[i], np.diff(times), view)

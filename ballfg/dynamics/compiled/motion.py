@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, plain
 from ballfg.dynamics.compiled.contacts import coefficients_of, contact_times, travel
 from ballfg.dynamics.compiled.ground import advance_one, roll_rows
 from ballfg.dynamics.compiled.kept_model import CompiledModel, KeptModel, carried
 from ballfg.dynamics.compiled.places import Numbers, numbers_of
+from ballfg.dynamics.compiled.roll_out import roll_out
 from ballfg.dynamics.motion.limits import MAX_CONTACTS, steps_over
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
@@ -81,9 +82,9 @@ class Moving:
         """(n,) m by which surfaces lie above their declared heights under the balls."""
         return self._value(SURFACE)[0][:, 0]
 
-    def rates(self) -> Array:
-        """(n, 6) m/s^2 and rad/s^2 in flight at the start."""
-        return self._value(RATES)[0]
+    def rates(self, part: int = RATES) -> Array:
+        """(n, 6) m/s^2 and rad/s^2 at the start, in flight; on a surface for `ROLLING`."""
+        return self._value(part)[0]
 
     def slopes(self, states: Array) -> tuple[Array, Array]:
         """(n, 9 + p) derivatives by time in flight, and (n, 9 + p, d) by the states.
@@ -109,7 +110,8 @@ class Moving:
         at = own if states is None else np.ascontiguousarray(states[:, :STATE_DIM])
         value, slopes = np.zeros((n, function.size)), np.zeros((n, function.size, d))
         c, ct = self.coefficients(part)
-        function.compute(at, c, self.weights[part], moved, ct, value, slopes)
+        weights = self._rolling_weights if part == ROLLING else self.weights[part]
+        function.compute(at, c, weights, moved, ct, value, slopes)
         return value, slopes
 
     def all_coefficients(self) -> list[Array]:
@@ -127,6 +129,13 @@ class Moving:
         x, moved = self._states()
         roll_rows(*self.laws, dt, level, self.functions.radius, x, moved)
         return self._whole(x, moved)
+
+    def roll_out(self, steps: Array, world: Array) -> Array:
+        """States (n, k, 9 + p) after durations (n, k) s one after another, through flight, contacts and rest."""
+        states, first = np.empty((*steps.shape, STATE_DIM)), np.ascontiguousarray(self.start[:, :STATE_DIM])
+        roll_out(*self.laws, first, plain(steps), world, states)
+        coefficients = self.start[:, None, STATE_DIM:].repeat(steps.shape[1], axis=1)
+        return np.concatenate((states, coefficients), axis=2) if coefficients.shape[2] else states
 
     def advance(self, dt: float, world: Array) -> tuple[Array, Array, Array]:
         """Where one ball is after dt s, the derivatives, and time (s) and height (m) of each bounce (k, 2) it made."""

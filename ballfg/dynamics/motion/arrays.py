@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.motion import limits
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
     from ballfg.dynamics.model import BallModel
@@ -101,6 +103,54 @@ def fly_through(model: "BallModel", states: Array, dt: Array, heights: Sequence[
 
     after, times = _by_torch(in_torch, model, states, dt, tuple(heights))
     return after, times
+
+
+def roll_out(model: "BallModel", states: Array, steps: Array, surfaces: Surfaces) -> Array:
+    """States (n, k, 9 + p) after durations (n, k) s one after another, through flight, contacts and rest."""
+    if (moving := _moving(model, states)) is not None:
+        return moving.roll_out(steps, motion.world_of(surfaces, model.radius))
+    from ballfg.dynamics.motion.rollout import rollout as in_torch
+
+    found: Array = _by_torch(in_torch, model, states, steps.cumsum(axis=1), surfaces)
+    return found
+
+
+def contact_times(model: "BallModel", states: Array, height: float) -> Array:
+    """As `contact.contact_time`: (n,) s until balls in states (n, 9 + p) touch a surface (m); NaN without a contact."""
+    if (moving := _moving(model, states)) is not None:
+        return moving.meets(np.full(len(states), height), np.full(len(states), limits.LONGEST_FALL))
+    from ballfg.dynamics.motion.contact import contact_time as in_torch
+
+    found: Array = _by_torch(in_torch, model, states, height)
+    return found
+
+
+def is_resting(model: "BallModel", states: Array, height: Array | float) -> NDArray[np.bool_]:
+    """As `rollout.is_resting`: which balls in states (n, 9 + p) lie on surfaces at a height (m) or heights (n,)."""
+    lies = np.abs(gaps(model, states, height)) <= limits.REST_GAP
+    return lies & (np.abs(states[:, VZ]) <= limits.REST_SPEED / 2)
+
+
+def place_on(model: "BallModel", states: Array, height: Array | float) -> Array:
+    """States (n, 9 + p) moved onto surfaces at a height (m) or heights (n,), their vertical velocity zero."""
+    placed = states.copy()
+    placed[:, Z] -= gaps(model, states, height)
+    placed[:, VZ] = 0.0
+    return placed
+
+
+def motion_rates(model: "BallModel", states: Array, *, rolls: bool) -> Array:
+    """(n, 9 + p) derivatives by time of states, in flight, or on a surface."""
+    if (moving := _moving(model, states)) is not None:
+        rates = np.zeros_like(states)
+        rates[:, POSITION] = states[:, VELOCITY]
+        rates[:, VELOCITY.start : STATE_DIM] = moving.rates(motion.ROLLING if rolls else motion.RATES)
+        return rates
+    from ballfg.dynamics.motion.flight_step import derivative
+
+    law = model.roll if rolls else model.rates
+    found: Array = _by_torch(lambda _, at: derivative(law, at), model, states)
+    return found
 
 
 def fly(model: "BallModel", states: Array, dt: Array) -> Array:

@@ -9,10 +9,8 @@ from torch import Tensor
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.compiled.functions import CompiledModel
-from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import STATE_DIM
 
 
 def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
@@ -55,15 +53,8 @@ def roll_jacobian(
 
 def roll_out(model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor:
     """Durations (n, k) s one after another, as in `rollout.rollout`: states (n, k, 9)."""
-    n, width = state.shape
     moving = motion.Moving(model, functions, _plain(state), 0)
-    states = np.empty((n, steps.shape[1], STATE_DIM))
-    durations, world = np.ascontiguousarray(steps.detach().numpy()), motion.world_of(surfaces, functions.radius)
-    roll_out_rows(*moving.laws, np.ascontiguousarray(moving.start[:, :STATE_DIM]), durations, world, states)
-    if width > STATE_DIM:
-        travelling = np.broadcast_to(moving.start[:, None, STATE_DIM:], (n, steps.shape[1], width - STATE_DIM))
-        states = np.concatenate((states, travelling), axis=2)
-    return torch.from_numpy(states)
+    return torch.from_numpy(moving.roll_out(_plain(steps), motion.world_of(surfaces, functions.radius)))
 
 
 def _numbers(given: Tensor | float, shape: torch.Size) -> Array:

@@ -1,18 +1,22 @@
 """Converts between true and recorded stamps, positions and spin labels by a model's measurement effects."""
 
+from __future__ import annotations
+
 import copy
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.rollout import advance
+from ballfg.deferred import torch
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.model import BallModel
 
 _MEASUREMENT = "measurement"  # Attribute of an `AnalyticModel` that holds its measurement effects
 ROUNDING = 1e-9  # Share by which singular values that are equal may differ
@@ -37,6 +41,8 @@ def plainly_measured(model: BallModel) -> BallModel:
 def _without_effects(model: BallModel) -> BallModel:
     if model.measures_plainly:
         return model
+    from ballfg.dynamics.model import BallModel
+
     plain = copy.copy(model)
     plain._modules = {
         name: _without_effects(child) if isinstance(child, BallModel) else child
@@ -63,16 +69,19 @@ def written_time(model: BallModel, first: float, time: float) -> float:
         return first + float(model.stamps(torch.tensor(time - first, dtype=torch.float64)))
 
 
-@torch.no_grad()
-def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> Tensor:
+def measured_positions(model: BallModel, states: Array, surfaces: Surfaces) -> Array:
     """(n, 3) m, expected measured positions of balls in true states (n, 9 + p), before noise."""
     if model.measures_plainly:
         return states[:, POSITION]
 
-    def later(delay: Tensor) -> Tensor:
-        return advance(model, states, delay.expand(len(states)), surfaces)[:, :STATE_DIM]
+    from ballfg.dynamics.motion.rollout import advance
 
-    return model.measured(states, later)
+    def later(delay: Tensor) -> Tensor:
+        return advance(model, true, delay.expand(len(true)), surfaces)[:, :STATE_DIM]
+
+    with torch.no_grad():
+        true = torch.from_numpy(states)
+        return np.asarray(model.measured(true, later).numpy())
 
 
 @dataclass(frozen=True)

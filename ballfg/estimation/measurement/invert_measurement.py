@@ -14,7 +14,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.rollout import advance
+from ballfg.dynamics.motion.arrays import roll_out
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement import as_measured
@@ -140,14 +140,13 @@ class InvertMeasurement(Estimator):
 
     def _shift(self, estimate: Estimate) -> Array:
         """(n, 3) m, distance between the measured and the true positions of the estimated states."""
-        states, model = torch.from_numpy(estimate.states), self.model
+        states, model = estimate.states, self.model
         if estimate.coefficient_names:
-            augmented = AugmentedModel(model, estimate.coefficient_names)
-            states, model = augmented.append(states, torch.from_numpy(estimate.coefficients)), augmented
+            states = np.concatenate((states, np.tile(estimate.coefficients, (len(states), 1))), axis=1)
+            model = AugmentedModel(model, estimate.coefficient_names)
         if len(states) > 1 and len(states) - 2 not in estimate.hits:
             # no later sample tells on which side of a bounce the last one is: shifted as if before it, a sample after
             # it would still look like one before, so that the motion must decide
-            with torch.no_grad():
-                dt = torch.from_numpy(np.diff(estimate.times[-2:]))
-                states = torch.cat((states[:-1], advance(model, states[-2:-1], dt, self.surfaces)))
-        return (as_measured.measured_positions(model, states, self.surfaces) - states[:, POSITION]).numpy()
+            moved = roll_out(model, states[-2:-1], np.diff(estimate.times[-2:])[None], self.surfaces)
+            states = np.concatenate((states[:-1], moved[:, 0]))
+        return as_measured.measured_positions(model, states, self.surfaces) - states[:, POSITION]

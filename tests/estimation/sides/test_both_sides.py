@@ -58,7 +58,7 @@ def test_a_prediction_starts_from_the_more_probable_side(doubtful: Bounced) -> N
         assert state.other_side[VZ, VZ] > 1.0
         assert np.linalg.eigvalsh(state.other_side / np.outer(state.sigmas[:9], state.sigmas[:9])).min() > -1e-9
         np.linalg.cholesky(state.joint)
-        carried = Belief.of(MODEL, [state]).covariance[0].numpy()
+        carried = Belief.of(MODEL, [state]).covariance[0]
         np.linalg.cholesky(carried)
         assert carried[VZ, VZ] < 0.05
         ahead = state.predict(0.06)
