@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.checks import check_count, check_path, shown, type_name
-from ballfg.dynamics.compiled.kept_model import check_model, ready_file
-from ballfg.dynamics.nominal import inertia_factor, nominal_model, ready_nominal
+from ballfg.dynamics.compiled.kept_model import check_model, ready_file, whole
+from ballfg.dynamics.nominal import inertia_factor, ready_nominal
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Estimate, Estimator, Settings
 from ballfg.estimation.registry import make_estimator
@@ -253,10 +253,11 @@ def diagnose(measured: "Tracks | Folder", model: Model = None, *, jobs: int = 1)
     if isinstance(data, SightedDataset):
         from ballfg.diagnosis.one_view.diagnosis import diagnose_one_view
 
-        return on_one_thread(partial(diagnose_one_view, data, jobs=jobs), _model(model, data))
+        return on_one_thread(partial(diagnose_one_view, data, jobs=jobs), whole(_model(model, data)))
     data = _table_of_positions(data)
     # as in the commands: threads gain nothing on such small batches, and slow each other down
-    return on_one_thread(partial(diagnose_dataset, _in_flight(data, jobs).dataset, jobs=jobs), _model(model, data))
+    flights_alone = _in_flight(data, jobs).dataset
+    return on_one_thread(partial(diagnose_dataset, flights_alone, jobs=jobs), whole(_model(model, data)))
 
 
 def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> "ErrorBudget":
@@ -277,7 +278,8 @@ def error_budget(measured: Dataset | Folder, model: Model = None, *, jobs: int =
     from ballfg.diagnosis.error_budget import error_budget as budget_of_dataset
     from ballfg.parallel.work import on_one_thread
 
-    return on_one_thread(partial(budget_of_dataset, _in_flight(data, jobs).dataset, jobs=jobs), _model(model, data))
+    flights_alone = _in_flight(data, jobs).dataset
+    return on_one_thread(partial(budget_of_dataset, flights_alone, jobs=jobs), whole(_model(model, data)))
 
 
 def _table_of_positions(measured: object) -> Dataset:
@@ -368,17 +370,13 @@ def estimator_for(
 def _model(model: Model, source: "Tracks | None") -> "BallModel":
     ball = TABLE_TENNIS if source is None else source.ball
     if model is None or isinstance(model, Ball):
-        return (nominal_model if source else ready_nominal)(ball if model is None else model)
+        return ready_nominal(ball if model is None else model)
     if not isinstance(model, str | PathLike):
         check_model(model, "Load one with load_model, or give its file.")
         return model
     room = None if source is None else source.info.name
     radius = None if source is None else ball.radius  # a track by itself is of the ball that a network knows
-    if source is None:
-        return ready_file(Path(model), radius=radius, inertia_factor=inertia_factor(ball), room=room)
-    from ballfg.dynamics import load_model
-
-    return load_model(Path(model), radius=radius, inertia_factor=inertia_factor(ball), room=room)
+    return ready_file(Path(model), radius=radius, inertia_factor=inertia_factor(ball), room=room)
 
 
 def _opened(measured: object) -> "Track | Tracks":

@@ -15,7 +15,7 @@ from ballfg.machine import usable_cores
 from ballfg.progress import print_doubts, print_notes, progress
 
 if TYPE_CHECKING:
-    from ballfg.dynamics import AnalyticModel, BallModel
+    from ballfg.dynamics import BallModel
     from ballfg.dynamics.surfaces import Surfaces
     from ballfg.estimation import Estimator, Settings
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
@@ -130,6 +130,12 @@ class Inputs(Generic[D]):
             return self
         found = flights_only(self.dataset, anyway)
         return replace(self, dataset=found.dataset, doubts=(*self.doubts, *found.lines))
+
+    def changing(self) -> "Inputs[D]":
+        """The same with the model itself, for work that changes it."""
+        from ballfg.dynamics.compiled.kept_model import whole
+
+        return replace(self, model=whole(self.model))
 
     def estimator(self, method: str, solver: "Solver | None" = None, group: str | None = None) -> "Estimator":
         """The estimator of a name, with the noise of the dataset.
@@ -250,10 +256,9 @@ def _opened(
     data: "Dataset | SightedDataset", model: Path | None, ball: str | None
 ) -> "tuple[BallModel, tuple[str, ...]]":
     """The same, with the doubts that were printed."""
-    import torch
-
-    from ballfg.dynamics import load_model, nominal_model
-    from ballfg.dynamics.nominal import TOLERANCE, inertia_factor, mismatch, nominal_note
+    from ballfg.deferred import on_one_thread
+    from ballfg.dynamics.compiled.kept_model import ready_file
+    from ballfg.dynamics.nominal import TOLERANCE, inertia_factor, mismatch, nominal_note, ready_nominal
     from ballfg.estimation.configure import table_note
     from ballfg.estimation.reading import unused_model
     from ballfg.tracks import Dataset
@@ -265,11 +270,11 @@ def _opened(
             f"--ball {ball} has a radius of {named.radius:g} m and {named.mass:g} kg; {data.path} states "
             f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
         )
-    torch.set_num_threads(1)  # the batches are small: threads cost more time than they save
-    found: BallModel = usual if file and usual is not None else nominal_model(own)
+    on_one_thread()
+    found: BallModel = usual if file and usual is not None else ready_nominal(own)
     if model is not None:
         inertia = inertia_factor(data.ball)
-        found = load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
+        found = ready_file(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
     doubts = _doubts_of(data, found, model)
     print_doubts(doubts)
     notes = [*data.notes, *filter(None, [table_note(data)])]
@@ -281,24 +286,19 @@ def _opened(
     return found, doubts
 
 
-def _named(ball: str) -> "tuple[Ball, AnalyticModel]":
+def _named(ball: str) -> "tuple[Ball, BallModel]":
     """A ball and its model: a known one by its name, or that of a ball file."""
-    from ballfg.dynamics import nominal_model
+    from ballfg.dynamics.nominal import ready_nominal
 
     if Path(ball).is_file():
         from ballfg.simulation.balls import ball_kind
 
         kind = ball_kind(ball)
         return kind.ball, kind.model
-    known = _known(ball)
-    return known, nominal_model(known)
-
-
-def _known(ball: str) -> "Ball":
-    """A known ball by its name."""
     from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
 
-    return KNOWN_BALLS[known_ball(ball)].ball
+    known = KNOWN_BALLS[known_ball(ball)].ball
+    return known, ready_nominal(known)
 
 
 def _doubts_of(data: "Dataset | SightedDataset", model: "BallModel", file: Path | None) -> tuple[str, ...]:
@@ -319,11 +319,9 @@ def model_alone(model: Path | None, ball: str | None) -> "tuple[BallModel, Setti
     Args: ball: name of the known ball that gives radius and inertia, or a ball file; None: table tennis.
     """
     from ballfg.dynamics.compiled.kept_model import ready_file
-    from ballfg.dynamics.nominal import ready_nominal
     from ballfg.estimation import Settings
 
-    name = ball or "table_tennis"
-    loaded: BallModel = (known := _named(name)[1] if Path(name).is_file() else ready_nominal(_known(name)))
+    loaded = known = _named(ball or "table_tennis")[1]
     if model is not None:
         loaded = ready_file(model, radius=None if ball is None else known.radius, inertia_factor=known.inertia_factor)
     settings = Settings.for_measured(loaded)

@@ -1,11 +1,16 @@
 """Holds the noise and the launcher that were learned together with a model."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.tracks.noise import TrackNoise
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 
 
 @dataclass(frozen=True)

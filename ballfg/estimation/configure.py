@@ -1,18 +1,17 @@
 """Chooses settings and surfaces for a dataset, from its statements of noise and table or else from its tracks."""
 
+from __future__ import annotations
+
 from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ballfg.checks import shown
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.model_file import check_spreads, model_to_dict
-from ballfg.dynamics.networks.fading import DOUBT
-from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.dynamics.compiled.kept_model import content_of
 from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
@@ -34,6 +33,9 @@ from ballfg.tracks.info import DatasetInfo
 from ballfg.tracks.noise import TrackNoise
 from ballfg.tracks.track import level_of
 
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
+
 TRACKS_FOR_NOISE = 50  # Number of tracks for the estimate of the measurement noise when a dataset does not state it
 KEPT = 8  # Number of datasets whose noise is cached: their tracks may be estimated one by one
 LEAST_TRACKS = 5  # Least number of tracks that shows how much tracks differ
@@ -53,8 +55,12 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
     about them. Other noise that the model or, second, the dataset states takes precedence. The model's groups of shots
     give the spin of tracks without a spin label.
     """
-    check_spreads(dataset.info.noise, model, f"dataset.yaml of {shown(dataset.info.name)}: ")
-    return _settings(dataset, model, (dataset.info.noise, _own_noise(dataset, model)))
+    stated = dataset.info.noise
+    if stated is not None and stated.coefficients:
+        from ballfg.dynamics.model_file import check_spreads
+
+        check_spreads(stated, model, f"dataset.yaml of {shown(dataset.info.name)}: ")
+    return _settings(dataset, model, (stated, _own_noise(dataset, model)))
 
 
 def usual_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Settings:
@@ -153,11 +159,13 @@ _FITTED: dict[tuple[Dataset | SightedDataset, Hashable, float], Settings | None]
 
 def _content(model: BallModel) -> Hashable:
     """Equal for analytic models with equal content, which every call of the front door makes or loads anew."""
+    from ballfg.dynamics.analytic import AnalyticModel
+
     values = tuple(p.detach().numpy().tobytes() for p in model.parameters())
     if not isinstance(model, AnalyticModel) or model.trained is not None:
         return model, values
     parts = tuple(type(module) for module in model.modules())
-    stated = repr((model.radius, model.inertia_factor, model_to_dict(model), model.declared_coefficients()))
+    stated = repr((model.radius, model.inertia_factor, content_of(model), model.declared_coefficients()))
     return parts, stated, values
 
 
@@ -184,6 +192,8 @@ def tracks_settings(
         settings: prior ones; for a trained model, with the noise of its training.
         position_known: True if the white noise of positions is stated.  watch: as for `fitted_settings`.
     """
+    from ballfg.dynamics.networks.fading import DOUBT
+
     doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
     outside = _share_outside(model, surfaces, plain, parts)
@@ -207,6 +217,8 @@ def _share_outside(model: BallModel, surfaces: Surfaces, settings: Settings, par
 
 def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessNoise:
     """Process noise plus the network's usual correction, weighted with the share of flights outside of its training."""
+    from ballfg.dynamics.networks.learned import LearnedModel
+
     if not isinstance(model, LearnedModel) or model.fading is None:
         return process
     kick = outside * float(model.fading.velocity) / np.sqrt(3.0)

@@ -4,8 +4,8 @@ from os import PathLike
 from pathlib import Path
 
 from ballfg.checks import check_path
-from ballfg.dynamics import nominal_model
-from ballfg.dynamics.model_file import model_to_dict
+from ballfg.dynamics.compiled.kept_model import content_of
+from ballfg.dynamics.nominal import ready_nominal
 from ballfg.estimation.observations.registry import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
 from ballfg.files.strict_yaml import read_mapping
@@ -46,7 +46,7 @@ def unused_model(folder: str | PathLike[str], ball: Ball) -> tuple[str, ...]:
     if not path.is_file():
         return ()
     try:
-        if read_mapping(path) == model_to_dict(nominal_model(ball)):
+        if read_mapping(path) == content_of(ready_nominal(ball)):
             return ()
     except ValueError:
         pass  # an unreadable file counts as another model; reading it raises where a user gives it as the model

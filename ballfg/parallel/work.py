@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from cloudpickle import dumps
 
+from ballfg.deferred import one_thread
 from ballfg.parallel.same_versions import differences
 
 T = TypeVar("T")
@@ -79,14 +80,8 @@ def loaded(modules: Sequence[str]) -> None:
 
 def on_one_thread(function: Callable[[T], R], argument: T) -> R:
     """A function's result, computed on one torch thread."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the processes share the cores already; and sums over threads differ in their last bits
-    try:
+    with one_thread():  # the processes share the cores already; and sums over threads differ in their last bits
         return function(argument)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def alone(function: Callable[[T], R], argument: T) -> R:

@@ -83,7 +83,7 @@ def design(
     if out is not None:
         TableWriter(out, name="out")  # refuses a path that cannot be written
         inputs.check_out(out, dataset)
-    opened = inputs.open_inputs(dataset, model, effects_file)
+    opened = inputs.open_inputs(dataset, model, effects_file).changing()
     if not isinstance(opened.model, AnalyticModel):
         raise ValueError(f"--model must be analytic: effects are added to it; {model} is a learned one. Give another.")
     check_labels(opened.dataset, tuple(levels))
@@ -148,7 +148,7 @@ def _stand(
     if out is not None:
         TableWriter(out, name="out")  # refuses a path that cannot be written
         inputs.check_out(out, dataset)
-    opened = inputs.open_inputs(dataset, model, effects_file)
+    opened = inputs.open_inputs(dataset, model, effects_file).changing()
     places = combinations({axis: levels[axis] for axis in "xyz"})
     found = where_to_stand(opened.dataset, opened.model, lens, places, noise=noise, jobs=jobs)
     print(f"{lens.name} at {len(found)} places, best first: median error; samples seen; strokes uncertain in depth")

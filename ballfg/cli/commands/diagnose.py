@@ -65,7 +65,8 @@ def diagnose(
         check_report_folder(out, force=force)
         inputs.know(observations=observations_file)
         opened, *others = [
-            inputs.open_source(source, dataset, model, effects_file).in_flight(anyway) for dataset in datasets
+            inputs.open_source(source, dataset, model, effects_file).changing().in_flight(anyway)
+            for dataset in datasets
         ]
         sighted = [isinstance(one.dataset, SightedDataset) for one in (opened, *others)]
         if others and any(sighted):

@@ -61,6 +61,7 @@ def noise(
 
     Example: ballfg noise data/ballgun --out noisy.yaml
     """
+    from ballfg.dynamics.compiled.kept_model import whole
     from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
     from ballfg.estimation.configure import usual_settings
     from ballfg.estimation.noise.estimate import held_with, spread_over
@@ -73,12 +74,12 @@ def noise(
             raise ValueError(
                 "--out and --write must be left out for detections: models and dataset.yaml hold no pixels"
             )
-        _of_pixels(inputs.open_source("detections", dataset, model), tracks)
+        _of_pixels(inputs.open_source("detections", dataset, model).changing(), tracks)
         return
     if out is not None:
         inputs.check_model_out(out)
     data = with_readings(read_dataset(dataset))
-    ball = inputs.open_model(data, model)
+    ball = whole(inputs.open_model(data, model))
     data = inputs.flights_only(data, anyway).dataset
     surfaces, chosen = dataset_surfaces(data), spread_over(data, len(data), tracks)
     assumed, usual = dataset_settings(data, ball), usual_settings(data, ball)

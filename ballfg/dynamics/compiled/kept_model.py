@@ -29,6 +29,7 @@ from ballfg.dynamics.variation import Variation, values_of_group, values_of_trac
 from ballfg.tracks.noise import TrackNoise
 
 if TYPE_CHECKING:
+    from ballfg.dynamics.analytic import AnalyticModel
     from ballfg.dynamics.compiled.translation.recipe import Recipe
     from ballfg.dynamics.model import BallModel
     from ballfg.tracks import Track
@@ -170,6 +171,12 @@ class KeptModel:
         return CompiledModel(rates, impact, surface, rolling, self.radius)
 
     @property
+    def content(self) -> dict[str, Any] | None:
+        """That of its file; None if its coefficients are others."""
+        own = "whole" not in vars(self) and self.alone is self and self._values == self._facts["values"]
+        return self._facts["content"] if own else None
+
+    @property
     def in_flight(self) -> KeptModel:
         """Itself."""
         return self
@@ -230,7 +237,7 @@ def augmented(model: BallModel, names: Sequence[str]) -> BallModel:
         return cast("BallModel", model.with_travelling(tuple(names)))
     from ballfg.dynamics.augmented import AugmentedModel
 
-    return AugmentedModel(model.whole if type(model) is KeptModel else model, names)
+    return AugmentedModel(whole(model), names)
 
 
 def carried(model: BallModel) -> tuple[BallModel, tuple[str, ...]]:
@@ -240,6 +247,20 @@ def carried(model: BallModel) -> tuple[BallModel, tuple[str, ...]]:
     from ballfg.dynamics.augmented import AugmentedModel
 
     return (model.model, model.names) if isinstance(model, AugmentedModel) else (model, ())
+
+
+def whole(model: BallModel) -> BallModel:
+    """The model itself, for work that changes it."""
+    return model.whole if type(model) is KeptModel else model
+
+
+def content_of(model: BallModel) -> dict[str, Any]:
+    """The content of the model file of an analytic model, as `model_to_dict`."""
+    if type(model) is KeptModel and (stated := model.content) is not None:
+        return stated
+    from ballfg.dynamics.model_file import model_to_dict
+
+    return model_to_dict(cast("AnalyticModel", model))
 
 
 def check_model(model: object, remedy: str) -> None:
@@ -291,6 +312,7 @@ def keep(about: str, model: BallModel) -> None:
     """Writes the note of a model for `ready`, if it is an analytic one that has machine code and measures plainly."""
     from ballfg.dynamics.analytic import AnalyticModel
     from ballfg.dynamics.compiled.functions import compiled, is_of_package
+    from ballfg.dynamics.model_file import model_to_dict
 
     plain = type(model) is AnalyticModel and model.trained is None and model.measures_plainly and not model.random
     if not plain or not is_of_package(model) or (functions := compiled(model)) is None:
@@ -303,6 +325,7 @@ def keep(about: str, model: BallModel) -> None:
         "inertia": model.inertia_factor,
         "learned_from": model.learned_from,
         **{name: None if one is None else one.to_mapping() for name, one in described.items()},
+        "content": model_to_dict(model),
         "variations": {name: one.to_mapping() for name, one in model.variations.items()},
         "values": dict(zip(numbers_of(model).scalars, numbers_of(model).values(), strict=True)),
         "coefficients": {name: asdict(one) for name, one in model.declared_coefficients().items()},

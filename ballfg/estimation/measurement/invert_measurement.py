@@ -4,16 +4,17 @@ Only the forward map is used, so any effect will do. With h(x) the measured posi
 shifted by h(x) - p(x) until the shift converges; x are the smoother's states of the shifted track.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
-from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.model import BallModel
+from ballfg.deferred import torch
+from ballfg.dynamics.compiled.kept_model import augmented
 from ballfg.dynamics.motion.arrays import roll_out
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -25,6 +26,9 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import Track
 from ballfg.tracks.track import FASTEST_SPIN, SPIN_LABELS
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 ROUNDS: Final = 20
 """Largest number of estimates of a track; a lag of 5 ms takes four or five, an offset of 30 ms a dozen."""
@@ -143,7 +147,7 @@ class InvertMeasurement(Estimator):
         states, model = estimate.states, self.model
         if estimate.coefficient_names:
             states = np.concatenate((states, np.tile(estimate.coefficients, (len(states), 1))), axis=1)
-            model = AugmentedModel(model, estimate.coefficient_names)
+            model = augmented(model, estimate.coefficient_names)
         if len(states) > 1 and len(states) - 2 not in estimate.hits:
             # no later sample tells on which side of a bounce the last one is: shifted as if before it, a sample after
             # it would still look like one before, so that the motion must decide

@@ -1,18 +1,20 @@
 """Estimates the noise of a set of tracks by the calibration of forecasts within them."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
 from ballfg.checks import check_each, check_flag, check_instance, check_range
-from ballfg.dynamics.model import BallModel
+from ballfg.deferred import torch
+from ballfg.dynamics.compiled.kept_model import check_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.measurement.as_measured import plainly_measured
@@ -36,6 +38,9 @@ from ballfg.parallel.work import on_one_thread
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
 from ballfg.tracks.noise import TrackNoise
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.model import BallModel
 
 T = TypeVar("T")
 
@@ -117,7 +122,7 @@ def estimate_noise(
         jobs: processes.
     Returns: None if no track is long enough.
     """
-    check_instance("model", model, BallModel, "Load one with load_model.")
+    check_model(model, "Load one with load_model.")
     check_instance("settings", settings, Settings, "Make them with Settings.for_measured(model).")
     for name, flag in (("position_known", position_known), ("tracker_known", tracker_known), ("errors", errors)):
         check_flag(name, flag)
@@ -184,7 +189,7 @@ def held_with(model: BallModel, surfaces: Surfaces, settings: Settings, tracks: 
     return math.nan if linear is None else on_one_thread(held, linear)
 
 
-def _search(parts: Sequence[Track], settings: Settings, known: tuple[bool, bool], linear: LinearTracks) -> "_Search":
+def _search(parts: Sequence[Track], settings: Settings, known: tuple[bool, bool], linear: LinearTracks) -> _Search:
     """The search from the origins that a robot would use, or earlier ones in tracks that are too short."""
     typical = float(np.median([part.duration for part in parts]))
     earliest, every = min(EARLIEST_START, EARLIEST_SHARE * typical), min(START_EVERY, EVERY_SHARE * typical)

@@ -7,17 +7,21 @@ grow linearly. The mean of the same for each next sample, the marginal likelihoo
 noise that forecasts leave undetermined.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from ballfg.deferred import torch
 from ballfg.estimation.noise.linear_filter import Filtered, LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.stamps import STAMP_TOLERANCE
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 HORIZONS: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """s ahead of a start; the first good sample at or after each is scored."""
@@ -138,7 +142,7 @@ class _Ahead:
     offsets: Tensor
 
     @classmethod
-    def of(cls, tracks: LinearTracks, starts: Tensor) -> "_Ahead":
+    def of(cls, tracks: LinearTracks, starts: Tensor) -> _Ahead:
         """All forecasts from some origins (r, 2), track and sample."""
         (track, start), (samples, own) = starts.T, (tracks.times.shape[1], tracks.transitions.shape[-1])
         begin, reached = tracks.times[track, start], torch.zeros(len(track), dtype=torch.float64)

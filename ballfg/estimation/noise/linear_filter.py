@@ -1,18 +1,17 @@
 """Filters linearised tracks with any noise: state, coefficients and the tracker's biases together."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
-import numpy as np
-import torch
-from torch import Tensor
-from torch.autograd.function import once_differentiable
-
-from ballfg.arrays import Array
-from ballfg.estimation.noise.filter_code import NEXT_FROM, filter_tracks
-from ballfg.estimation.noise.filter_derivative import pull_back
+from ballfg.deferred import torch
+from ballfg.estimation.noise.filter_code import NEXT_FROM
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import LEAST_NOISE
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 BIAS_DIM: Final = 3
 
@@ -80,6 +79,8 @@ class LinearFilter:
         tracks: linearised.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
         biased: True if the noise may have a memory; False saves three numbers of the state, and time.
+
+    Attributes: first: (t, w) first errors and biases.  seen: (t, n) 1 for the samples that it takes in.
     """
 
     def __init__(self, tracks: LinearTracks, velocity_prior: float, *, biased: bool = True) -> None:
@@ -88,8 +89,8 @@ class LinearFilter:
         self.own = tracks.transitions.shape[-1]
         self.biases = BIAS_DIM if biased else 0
         self.width = self.own + self.biases
-        self._starts = torch.nn.functional.pad(tracks.starts, (0, self.biases)).contiguous().numpy()
-        self._used = tracks.used.to(torch.int64).numpy()
+        self.first = torch.nn.functional.pad(tracks.starts, (0, self.biases)).contiguous().numpy()
+        self.seen = tracks.used.to(torch.int64).numpy()
         self._scored = int(tracks.used[:, NEXT_FROM:].sum())
 
     def measured(self, noise: Noise) -> Tensor:
@@ -132,44 +133,7 @@ class LinearFilter:
         decays = torch.exp(-torch.diff(self.tracks.times, dim=1) / memory_time[:, None])
         memory = variances.memory
         prior = torch.cat((variances.prior, memory[:, : self.biases]), dim=1)
-        means, covariances, nll = _Run.apply(self, variances.process, decays, memory, prior, variances.measured)
+        from ballfg.estimation.noise.differentiable_filter import FilterRun
+
+        means, covariances, nll = FilterRun.apply(self, variances.process, decays, memory, prior, variances.measured)
         return Filtered(means, covariances, nll, self._scored)
-
-
-class _Run(torch.autograd.Function):
-    """The compiled filter as a function that torch can differentiate once."""
-
-    @staticmethod
-    def forward(ctx: Any, tracks: LinearFilter, *noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        linear, shape = tracks.tracks, (tracks.count, tracks.samples)
-        process, decays, memory, prior, measured = (tensor.detach().contiguous().numpy() for tensor in noise)
-        sizes = ((tracks.width,), (tracks.width, tracks.width), (tracks.width, 3), (3, 3), (3,), ())
-        made = [np.empty(shape + size) for size in sizes]
-        nll = np.empty(tracks.count)
-        moved = [x.numpy() for x in (linear.transitions, linear.offsets, linear.kicks)]
-        seen = linear.errors.numpy(), tracks._used, tracks._starts
-        if not filter_tracks(*moved, process, decays, memory, measured, *seen, prior, *made, nll):
-            raise torch.linalg.LinAlgError("the covariance of an innovation is not positive definite")
-        ctx.tracks, ctx.decays, ctx.memory, ctx.made = tracks, decays, memory, made
-        ctx.set_materialize_grads(False)
-        return torch.from_numpy(made[0]), torch.from_numpy(made[1]), torch.from_numpy(nll)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, by_mean: Tensor | None, by_covariance: Tensor | None, by_following: Tensor | None) -> Any:
-        tracks, (means, covariances, *_) = ctx.tracks, ctx.made
-        linear, (count, samples, width) = tracks.tracks, means.shape
-        if by_mean is None and by_covariance is None:  # of the densities of next samples alone
-            by_states = np.empty((count, 0, width)), np.empty((count, 0, width, width))
-        else:
-            by_states = _dense(by_mean, means), _dense(by_covariance, covariances)
-        shapes = (linear.kicks.shape[2],), (samples - 1,), (BIAS_DIM,), (width,), (samples, 3, 3)
-        found = [np.empty((count, *shape)) for shape in shapes]
-        moved = linear.transitions.numpy(), linear.kicks.numpy(), ctx.decays, ctx.memory, tracks._used
-        pull_back(*moved, *ctx.made, *by_states, _dense(by_following, np.empty(count)), *found)
-        return None, *(torch.from_numpy(x) for x in found)
-
-
-def _dense(derivative: Tensor | None, like: Array) -> Array:
-    """A derivative as a dense array for machine code; zeros for None."""
-    return np.zeros(like.shape) if derivative is None else np.asarray(derivative.contiguous().numpy())

@@ -5,17 +5,18 @@ the offset of the estimate itself from the model. F and o come from the dynamics
 contacts with their saltation included. A Kalman filter over deviations then gives forecasts for any noise.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.deferred import torch
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.settings import sample_sigmas
@@ -27,6 +28,9 @@ from ballfg.factors.noise import PROCESS_NOISE, Kicks
 from ballfg.progress import Watch, unwatched
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 LEAST_SAMPLES = 6
 """Least number of samples: the fit of a shorter track absorbs all of its noise."""

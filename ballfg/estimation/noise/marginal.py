@@ -5,9 +5,9 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
+from ballfg.deferred import torch
 from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
 from ballfg.estimation.noise.parameters import Parameter, tensors_of
 from ballfg.estimation.settings import Settings

@@ -1,19 +1,23 @@
 """Maps the estimated numbers of the noise to a vector of logarithms with a prior, and back to settings."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.deferred import torch
 from ballfg.estimation.measurement.position_noise import FACTOR_FOUR
 from ballfg.estimation.noise.linear_filter import Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import PROCESS_NOISE
 from ballfg.tracks.noise import TrackNoise
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)

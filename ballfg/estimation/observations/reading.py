@@ -1,21 +1,19 @@
 """A reading compares an instrument's numbers with one torch function of the ball's state."""
 
+from __future__ import annotations
+
 import copy
 from abc import abstractmethod
 from collections.abc import Hashable, Mapping
 from functools import partial
-from typing import ClassVar, Final, Self
+from typing import TYPE_CHECKING, ClassVar, Final, Self
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.checks import check_array, check_instance, shown
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.flight_step import rk4_step
-from ballfg.dynamics.motion.integrate import batch_jacobian
+from ballfg.deferred import torch
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.loss import Loss
@@ -23,6 +21,11 @@ from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import Track
 from ballfg.tracks.stamps import elapsed
 from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ballfg.dynamics.model import BallModel
 
 FARTHEST: Final = 0.05  # s. A reading farther from every sample is refused: the ball may bounce in so long a time
 LEAST_SPEED: Final = 1e-6  # m/s. Below it the derivative of the velocity's length is set to zero
@@ -263,6 +266,8 @@ class ReadingFactors(FactorBatch):
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, dim) and Jacobians (k, dim, 9)."""
+        from ballfg.dynamics.motion.integrate import batch_jacobian
+
         function = partial(self._whitened, rows)
         residual, jacobian = batch_jacobian(function, torch.from_numpy(inputs[0]), outputs=self.dim)
         return residual.numpy(), (jacobian.numpy(),)
@@ -274,6 +279,8 @@ class ReadingFactors(FactorBatch):
     def _whitened(self, rows: Index | slice, state: Tensor) -> Tensor:
         values, sigma, delay = (torch.from_numpy(a[rows]) for a in (self.values, self.sigma, self.delay))
         if bool(delay.any()):
+            from ballfg.dynamics.motion.flight_step import rk4_step
+
             state = rk4_step(self.model.rates, state, delay.unsqueeze(-1))
         found, shape = self.predicted(state), (*state.shape[:-1], self.dim)
         if found.shape != shape:  # torch would repeat a single column for all, without a word
