@@ -51,7 +51,7 @@ def one_thread() -> Iterator[None]:
     try:
         yield
     finally:
-        os.environ.pop(THREADS)
+        os.environ.pop(THREADS, None)  # threads may share this
         if stated is not None:
             os.environ[THREADS] = stated
         if "torch" in sys.modules:

@@ -18,6 +18,7 @@ from ballfg.parallel.processes import Processes
 from ballfg.parallel.same_versions import own_versions
 from ballfg.parallel.stream import AHEAD, HELPED, finished, in_order
 from ballfg.parallel.work import KEPT, Work, _functions, compute, packed
+from tests.interpreter import fresh
 
 NUMBERS = list(range(60))
 
@@ -165,6 +166,16 @@ def asks_for_processes(chunk: Sequence[int]) -> list[bool]:
 def test_work_inside_of_a_chunk_stays_there_on_one_thread() -> None:
     assert executor(2) is not None
     assert all(in_order(asks_for_processes, fours(), Processes(2)))
+
+
+@pytest.mark.parametrize("before", ["", "import torch; torch.set_num_threads(2);"])
+def test_torch_has_its_threads_again_where_it_was_imported_meanwhile(before: str) -> None:
+    code = (
+        "import os; os.environ['OMP_NUM_THREADS'] = '2';" + before + "from ballfg.deferred import one_thread, torch\n"
+        "with one_thread():\n    inside = torch.get_num_threads()\n"
+        "print(inside, torch.get_num_threads(), os.environ['OMP_NUM_THREADS'])"
+    )
+    assert fresh(code, check=True).stdout.split() == ["1", "2", "2"]
 
 
 def test_a_worker_refuses_other_versions_and_keeps_few_functions() -> None:

@@ -12,7 +12,7 @@ from ballfg.dynamics import AnalyticModel, Surfaces, load_model, nominal_model, 
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled import kept_model
 from ballfg.dynamics.compiled.build import read_note
-from ballfg.dynamics.compiled.kept_model import KeptModel, augmented, carried, keep, ready, ready_file
+from ballfg.dynamics.compiled.kept_model import KeptModel, augmented, carried, content_of, keep, ready, ready_file
 from ballfg.dynamics.compiled.motion import Moving, functions_of
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel
@@ -22,7 +22,9 @@ from ballfg.dynamics.population import SpinGroup, SpinPopulation
 from ballfg.dynamics.variation import Variation
 from ballfg.estimation import Settings, Smoother
 from ballfg.tracks import TABLE_TENNIS, Track
+from ballfg.tracks.info import DatasetInfo
 from ballfg.tracks.noise import TrackNoise
+from ballfg.tracks.writing import write_dataset
 from tests.interpreter import fresh
 
 STATES = np.array(
@@ -39,10 +41,21 @@ found = [bf.estimate((t[:n], places[:n]), model={model}) for n in (40, 120)]
 stream = bf.Online(bf.Ball(0.02, 0.0027), bf.Surfaces(0.0))
 states = [stream.push(a, b) for a, b in zip(t, places)]
 found += [states[-1].state, states[-1].covariance]
+ahead = found[0].last.predict(1.0)
+found += [ahead.states, ahead.covariances]
+found += [event.covariance for event in (ahead.next_contact, ahead.apex, ahead.crossing(z=0.1, after=1))]
+found.append(np.array([ahead.event(asked).probability for asked in ("apex", "next-contact", "x=1.0")]))
 print(hashlib.sha256(b"".join(np.ascontiguousarray(getattr(x, "states", x)).tobytes() for x in found)).hexdigest())
 print("torch" in sys.modules)
 from ballfg.dynamics.model import BallModel
 print(isinstance(found[0].last.world.model, BallModel))
+"""
+COMMAND = """
+import atexit, sys
+atexit.register(lambda: print("torch:", "torch" in sys.modules))
+sys.argv = ["ballfg", *{words}]
+from ballfg.cli.entry import ballfg
+ballfg()
 """
 
 
@@ -69,6 +82,8 @@ def test_it_says_what_the_model_says(usual: AnalyticModel) -> None:
         assert getattr(kept, name) == getattr(usual, name)
     assert kept.declared_coefficients() == usual.declared_coefficients()
     assert numbers_of(kept).values() == numbers_of(usual).values()
+    assert content_of(kept) == model_to_dict(usual)
+    assert content_of(kept.for_group("ball", "new")) == model_to_dict(usual.for_group("ball", "new"))
     assert kept.states_position_noise
     assert kept.measures_plainly
     assert Settings.for_measured(kept) == Settings.for_measured(usual)
@@ -176,3 +191,22 @@ def test_estimates_of_a_fresh_process_need_no_torch(of_file: bool, tmp_path: Pat
     said = [fresh(TWICE.format(first=first, model=model), check=True).stdout.split() for first in ("import torch", "")]
     assert said[0][0] == said[1][0]
     assert (said[0][1:], said[1][1:]) == (["True", "True"], ["False", "True"])
+
+
+def test_commands_on_a_dataset_need_no_torch(tmp_path: Path) -> None:
+    """Of one track, which does not show its noise; the model file beside the tracks is the usual one."""
+    times = np.arange(50) / 100.0
+    path = np.stack([4.0 * times, 0.1 + 0.0 * times, 0.3 + 1.5 * times - 4.7 * times**2], axis=1)
+    path += 0.002 * np.random.default_rng(0).normal(size=path.shape)
+    write_dataset(tmp_path / "shots", DatasetInfo("shots", None, TABLE_TENNIS), [Track(times, path, name="one")])
+    save_model(nominal_model(), tmp_path / "shots" / "model.yaml")
+    keep_nominal(TABLE_TENNIS)
+    for words in (
+        ["estimate", "shots", "--out", "states.csv"],
+        ["predict", "shots", "--observe", "0.3", "--out", "ahead.csv"],
+        ["live", "--replay", "shots", "--speed", "0", "--plane", "x=1.5", "--out", "stream.jsonl"],
+        ["show", "shots", "--out", "shots.html"],
+    ):
+        said = fresh(COMMAND.format(words=words), cwd=tmp_path, check=True)
+        assert (tmp_path / words[-1]).is_file(), said.stderr
+        assert said.stdout.endswith("torch: False\n"), words[0]
