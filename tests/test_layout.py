@@ -10,8 +10,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LEVELS = (
     ("interrupts",),
-    ("state", "arrays", "checks", "registry", "machine", "deferred", "collector"),
-    ("progress",),
+    ("state", "arrays", "checks", "registry", "machine", "collector"),
+    ("progress", "deferred"),
     ("files",),
     ("parallel",),
     ("tracks",),

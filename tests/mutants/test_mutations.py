@@ -118,7 +118,7 @@ def test_a_constant_is_used_by_those_who_import_it(names: Names) -> None:
 
 
 def test_a_name_is_used_under_another_one_and_by_generated_code(names: Names) -> None:
-    file = "ballfg/dynamics/motion/by_machine_code.py"
+    file = "ballfg/dynamics/compiled/motion.py"
     lines = (ROOT / file).read_text(encoding="utf-8").splitlines()
     assert "from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows" in lines
     called = [i for i, line in enumerate(lines, 1) if line.strip().startswith("roll_out_rows(")]

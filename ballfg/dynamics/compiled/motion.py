@@ -15,7 +15,7 @@ from ballfg.dynamics.compiled.contacts import coefficients_of, contact_times, tr
 from ballfg.dynamics.compiled.ground import advance_one, roll_rows
 from ballfg.dynamics.compiled.kept_model import CompiledModel, KeptModel, carried
 from ballfg.dynamics.compiled.places import Numbers, numbers_of
-from ballfg.dynamics.compiled.roll_out import roll_out
+from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.motion.limits import MAX_CONTACTS, steps_over
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
@@ -133,7 +133,7 @@ class Moving:
     def roll_out(self, steps: Array, world: Array) -> Array:
         """States (n, k, 9 + p) after durations (n, k) s one after another, through flight, contacts and rest."""
         states, first = np.empty((*steps.shape, STATE_DIM)), np.ascontiguousarray(self.start[:, :STATE_DIM])
-        roll_out(*self.laws, first, plain(steps), world, states)
+        roll_out_rows(*self.laws, first, plain(steps), world, states)
         coefficients = self.start[:, None, STATE_DIM:].repeat(steps.shape[1], axis=1)
         return np.concatenate((states, coefficients), axis=2) if coefficients.shape[2] else states
 
