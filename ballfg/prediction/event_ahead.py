@@ -5,6 +5,8 @@ balls is moved through bounces and past edges, and those that have the event are
 has an event with a small probability, or none on its mean path.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,7 +22,7 @@ from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief, normal_points, root_of
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
-from ballfg.prediction.plane import APEX, AXES, Plane
+from ballfg.prediction.plane import APEX, AXES, CONTACT, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
@@ -48,16 +50,18 @@ class EventAhead:
     probability: float
 
 
-def event_on(path: "Path", asked: Plane | str) -> EventAhead:
+def event_on(path: Path, asked: Plane | str) -> EventAhead:
     """The first event of a kind on a path; asked: as from `asked_event`."""
-    if isinstance(asked, Plane):
-        return EventAhead(path.crossing(asked), _chance_of(path, asked))
-    if asked == APEX:
-        return EventAhead(path.apex(), path.probability(TOP, 0.0, "down"))
-    return EventAhead(*contact_ahead(path))
+    if asked == CONTACT:
+        return EventAhead(*contact_ahead(path))
+    line = Line.of(asked)
+    found, alike = path.mean_event(line)
+    if found is None or not alike:
+        return EventAhead(found and path.of_all(found, line), _chance_of(path, line))
+    return EventAhead(found, _sooner(found, path.start.time + path.horizon - found.time))
 
 
-def contact_ahead(path: "Path") -> tuple[Crossing | None, float]:
+def contact_ahead(path: Path) -> tuple[Crossing | None, float]:
     """The next contact within the horizon, and the probability that there is one.
 
     While the state is in doubt whether the ball has bounced just now, a ball on the other side has another contact: the
@@ -78,7 +82,7 @@ def contact_ahead(path: "Path") -> tuple[Crossing | None, float]:
     return (None if found is None or found.time > end else found), chance
 
 
-def _may_pass_an_end(path: "Path", found: Crossing | None, since: float = -math.inf, until: float = math.inf) -> bool:
+def _may_pass_an_end(path: Path, found: Crossing | None, since: float = -math.inf, until: float = math.inf) -> bool:
     """Whether some balls may come down on the table and others past its ends, before a time (s).
 
     Args: found: the mean's first contact after a time `since`, s.
@@ -97,7 +101,7 @@ def _may_pass_an_end(path: "Path", found: Crossing | None, since: float = -math.
     return sooner and bool((np.abs(found.state[:2].repeat(2) - extent) < near).any())
 
 
-def _past_or_not(path: "Path", found: Crossing | None, chance: float) -> tuple[Crossing | None, float]:
+def _past_or_not(path: Path, found: Crossing | None, chance: float) -> tuple[Crossing | None, float]:
     """The mean's contact and its probability; from possible balls if these differ in the surface that they meet."""
     heights = path.carried[0].surfaces.heights()
     balls = Path(path.start, path.carried, path.horizon + LATER).possible
@@ -124,7 +128,7 @@ def _sooner(found: Crossing, left: float) -> float:
     return 0.5 * math.erfc(-left / (math.sqrt(2.0) * max(found.time_sigma, np.finfo(float).tiny)))
 
 
-def _other_contact(path: "Path", found: Crossing | None) -> tuple[float, Crossing | None]:
+def _other_contact(path: Path, found: Crossing | None) -> tuple[float, Crossing | None]:
     """The share of balls on the other side of a present bounce, and their next contact; None without any doubt.
 
     The share follows from the variance of the vertical speed that the doubt gives and the jump of that speed.
@@ -145,14 +149,13 @@ def _other_contact(path: "Path", found: Crossing | None) -> tuple[float, Crossin
     return min(variance / jump**2, MOST), other
 
 
-def _chance_of(path: "Path", plane: Plane) -> float:
-    """The probability of a crossing; on the other side of a present bounce a ball has one more ahead, or one less."""
-    asked = (*_line_of(plane), plane.direction)
-    chance = path.probability(*asked, plane.after)
-    if not plane.after or path.start.other_side is None:
+def _chance_of(path: Path, line: Line) -> float:
+    """Share of balls with an event; on the other side of a present bounce a ball has one bounce more or less ahead."""
+    chance = path.probability(line)
+    if not line.after or path.start.other_side is None:
         return chance
     share, _ = _other_contact(path, path.contact())
-    other = path.probability(*asked, plane.after + (-1 if path.start.state[VZ] > 0.0 else 1))
+    other = path.probability(replace(line, after=line.after + (-1 if path.start.state[VZ] > 0.0 else 1)))
     return chance + share * (other - chance)
 
 
@@ -185,11 +188,57 @@ def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
     return belief.within_bounds(start)
 
 
+@dataclass(frozen=True, eq=False)
+class Line:
+    """An event at which a line of the state goes through an offset: an apex, or the crossing of a plane.
+
+    Attributes:
+        normal: (9,), offset: the ball has the event where normal . state is the offset.
+        direction: `up`, `down` or `either`.  after: number of bounces before it.
+    """
+
+    normal: Array
+    offset: float
+    direction: str
+    after: int
+
+    @classmethod
+    def of(cls, asked: Plane | str) -> Line:
+        """The line of a plane; of `apex` for any text."""
+        if not isinstance(asked, Plane):
+            return cls(TOP, 0.0, "down", 0)
+        normal, (towards, place) = np.zeros(STATE_DIM), asked.line
+        normal[POSITION] = towards
+        return cls(normal, place, asked.direction, asked.after)
+
+    @property
+    def is_apex(self) -> bool:
+        """True for an apex."""
+        return bool(self.normal[VZ])
+
+    def value(self, states: Array) -> Array:
+        """(...) line . state beyond the offset, of states (..., 9)."""
+        return np.asarray(states @ self.normal - self.offset)
+
+    def find(self, propagator: Propagator, belief: Belief, horizon: float, since: float) -> Crossing | None:
+        """The mean ball's first event after a time, s."""
+        if self.is_apex:
+            return apex(propagator, belief, horizon, after=since)
+        line = self.normal[POSITION], self.offset
+        return plane_crossing(propagator, belief, *line, horizon, after=since, direction=self.direction)
+
+    def may_turn(self, found: Crossing) -> bool:
+        """Whether some balls may not be fast enough to cross where the mean does; all balls fall at an apex."""
+        normal = self.normal[POSITION]
+        variance = normal @ found.covariance[VELOCITY, VELOCITY] @ normal
+        return abs(float(normal @ found.state[VELOCITY])) <= FAR * math.sqrt(max(variance, 0.0)) and not self.is_apex
+
+
 @dataclass(frozen=True)
 class Path:
     """The way of a ball ahead: what carries it on from the start, up to a horizon, s."""
 
-    start: "BallState"
+    start: BallState
     carried: Carried
     horizon: float
 
@@ -225,45 +274,54 @@ class Path:
 
     def crossing(self, plane: Plane) -> Crossing | None:
         """The crossing of a plane by the mean ball, with the covariance of all balls about it that have one."""
-        since = -math.inf
-        for _ in range(plane.after):
-            contact = self.contact(since)
-            if contact is None:
-                return None
-            since = contact.time
-        line = (plane.normal, plane.offset)
-        found = plane_crossing(*self.carried, *line, self.horizon, after=since, direction=plane.direction)
-        return None if found is None else self._of_all(found, *_line_of(plane), plane.direction, plane.after)
+        return self._event(Line.of(plane))
 
     def apex(self) -> Crossing | None:
         """The next highest point of the mean ball, with the covariance of all balls about it that have one."""
-        found = apex(*self.carried, self.horizon)
-        return None if found is None else self._of_all(found, TOP, 0.0, "down", 0)
+        return self._event(Line.of(APEX))
 
-    def _of_all(self, found: Crossing, line: Array, offset: float, direction: str, after: int) -> Crossing:
-        """The mean's event, with the moments of possible balls where these are not its neighbours.
+    def _event(self, line: Line) -> Crossing | None:
+        found, alike = self.mean_event(line)
+        return found if found is None or alike else self.of_all(found, line)
+
+    def mean_event(self, line: Line) -> tuple[Crossing | None, bool]:
+        """The mean ball's event, and whether all balls have it as its neighbours do: sooner or later, near its place.
 
         Near a bounce some have it before and others after; some have had it just now, and have it again later or in
-        the other direction; by an end of the table some meet the table and others do not.
+        the other direction; by an end of the table some meet the table and others do not; some turn before a plane.
         """
-        apart = self._just_now(line, offset) or self._by_an_end(found.time + FAR * found.time_sigma)
-        if not (apart or self._near_a_bounce(found, line)):
-            return found
-        times, states, met = self._events(line, offset, direction, after)
-        if len(met) == 0 or not (apart or (met != met[0]).any()):
+        since = -math.inf
+        for _ in range(line.after):
+            contact = self.contact(since)
+            if contact is None:
+                return None, False
+            since = contact.time
+        found = line.find(*self.carried, self.horizon, since)
+        alike = found is not None and not (self._apart(found, line) or self._near_a_bounce(found, line))
+        return found, alike
+
+    def of_all(self, found: Crossing, line: Line) -> Crossing:
+        """The mean's event with the moments of possible balls that have one; itself if they bounce as often before."""
+        times, states, met = self._events(line)
+        if len(met) == 0 or not (self._apart(found, line) or (met != met[0]).any()):
             return found
         return _spread_over(found, states, times - (found.time - self.start.time))
 
-    def _just_now(self, line: Array, offset: float) -> bool:
+    def _apart(self, found: Crossing, line: Line) -> bool:
+        """Whether some balls may have another event than the mean, or none, even if they bounce as often before."""
+        until = found.time + FAR * found.time_sigma
+        return self._just_now(line) or line.may_turn(found) or self._by_an_end(until)
+
+    def _just_now(self, line: Line) -> bool:
         """Whether some balls may be on the other side of an event than the mean at the start."""
         belief, own = self.carried[1], slice(STATE_DIM)  # without the other side of a contact
-        variance = line @ belief.covariance[0, own, own] @ line
-        return bool(abs(line @ self.start.state - offset) < FAR * math.sqrt(max(variance, 0.0)))
+        variance = line.normal @ belief.covariance[0, own, own] @ line.normal
+        return bool(abs(line.value(self.start.state)) < FAR * math.sqrt(max(variance, 0.0)))
 
-    def _near_a_bounce(self, found: Crossing, line: Array) -> bool:
+    def _near_a_bounce(self, found: Crossing, line: Line) -> bool:
         """Whether some balls may have bounced at an event, and others not."""
         about = FAR * found.time_sigma
-        if not line[VZ]:
+        if not line.is_apex:
             speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
             about += FAR * math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed
         contact = self.contact(found.time - about)
@@ -279,36 +337,30 @@ class Path:
             since = np.inf if contact is None else contact.time
         return False
 
-    def _events(self, line: Array, offset: float, direction: str, after: int) -> tuple[Array, Array, Array]:
+    def _events(self, line: Line) -> tuple[Array, Array, Array]:
         """Times (m,) s since the start, states (m, 9) and numbers of bounces (m,) of the balls that have an event."""
-        balls, above = self.possible, self.possible.states @ line > offset
-        crossed = (above[:, :-1] != above[:, 1:]) & (balls.met[:, :-1] >= after)
-        if direction != "either":
-            crossed &= above[:, :-1] == (direction == "down")
+        balls, above = self.possible, line.value(self.possible.states) > 0.0
+        crossed = (above[:, :-1] != above[:, 1:]) & (balls.met[:, :-1] >= line.after)
+        if line.direction != "either":
+            crossed &= above[:, :-1] == (line.direction == "down")
         rows = np.flatnonzero(crossed.any(axis=1))
         at = crossed[rows].argmax(axis=1)
-        times, states = balls.topped(rows, at) if line[VZ] else balls.crossed(rows, at, line[POSITION], offset)
+        plane = line.normal[POSITION], line.offset
+        times, states = balls.topped(rows, at) if line.is_apex else balls.crossed(rows, at, *plane)
         return times, states, balls.met[rows, at]
 
-    def probability(self, line: Array, offset: float, direction: str, after: int = 0) -> float:
-        """Share of balls whose line (9,) . state goes through an offset in a direction, after a number of bounces."""
+    def probability(self, line: Line) -> float:
+        """Share of balls whose line . state goes through the offset in a direction, after a number of bounces."""
         balls = self.possible
-        value, rate = balls.states @ line - offset, balls.states[..., VELOCITY] @ line[POSITION]
+        value, rate = line.value(balls.states), balls.states[..., VELOCITY] @ line.normal[POSITION]
         before, later = rate[:, :-1], rate[:, 1:]
         turns = before * later < 0.0  # the highest or lowest point between two moments, of a parabola
         turn = np.where(turns, 0.5 * before**2 * np.diff(balls.times) / np.where(turns, before - later, 1.0), 0.0)
         values = np.empty((len(value), 2 * value.shape[1] - 1))
         values[:, ::2], values[:, 1::2] = value, value[:, :-1] + turn
-        counts = np.repeat(balls.met >= after, 2, axis=1)[:, :-1]
+        counts = np.repeat(balls.met >= line.after, 2, axis=1)[:, :-1]
         first, then = (values > 0.0) & counts, (values < 0.0) & counts
-        if direction == "either":
+        if line.direction == "either":
             return float((first.any(axis=1) & then.any(axis=1)).mean())
-        first, then = (then, first) if direction == "up" else (first, then)
+        first, then = (then, first) if line.direction == "up" else (first, then)
         return float((np.maximum.accumulate(first, axis=1) & then).any(axis=1).mean())
-
-
-def _line_of(plane: Plane) -> tuple[Array, float]:
-    """Line (9,) and offset of a plane: a ball is on it where line . state is the offset."""
-    line, (normal, offset) = np.zeros(STATE_DIM), plane.line
-    line[POSITION] = normal
-    return line, offset
