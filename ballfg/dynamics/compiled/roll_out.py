@@ -84,19 +84,21 @@ def roll_out(
             put(states[r, j], x[r])
 
 
-@machine_code(FLAG(LAW, ONE, ONE))
-def _lies(surface, x, world):
-    """Whether a ball x (9,) lies on what is below it."""
-    return is_slow(x) and lies_on(surface, x, level_below(surface, x, world), world)
+@machine_code(NOTHING(LAW, TWO, TWO, TWO, REAL, COUNTS))
+def _push(surface, x, worlds, pushes, h, held):
+    """Changes the velocities of balls x (m, 9) as pushes (m, 3) m/s^2 do within h s; at rest they stay on the surface.
 
-
-@machine_code(NOTHING(ONE, ONE, REAL, FLAG))
-def _push(x, push, h, lies):
-    """Changes the velocity of a ball x (9,) as a push (3,) m/s^2 does within h s; at rest it stays on its surface."""
-    x[3] += h * push[0]
-    x[4] += h * push[1]
-    if not lies:
-        x[5] += h * push[2]
+    Rows of arrays are taken for the few balls at rest alone: numba counts who holds one, which takes longer than this.
+    Writes: held (m,), 1 for the balls at rest; those that have 1 already stay.
+    """
+    for r in range(len(x)):
+        if not held[r] and abs(x[r, 5]) <= REST_SPEED / 2:
+            own = only(surface, r)
+            held[r] = int(lies_on(own, x[r], level_below(own, x[r], worlds[r]), worlds[r]))
+        x[r, 3] += h * pushes[r, 0]
+        x[r, 4] += h * pushes[r, 1]
+        if not held[r]:
+            x[r, 5] += h * pushes[r, 2]
 
 
 @machine_code(NOTHING(ONE, ONE, REAL, REAL, ONE))
@@ -198,10 +200,13 @@ def _coming_down(laws, x, after, h, worlds, which, tau, touch, level, doubtful):
     surface.compute(x, surface.c, surface.w, none, surface.ct, under, unmoved)
     surface.compute(after, surface.c, surface.w, none, surface.ct, raised, unmoved)
     for r in range(m):
-        world, doubtful[r] = worlds[r], int(is_slow(x[r]))
+        doubtful[r] = int(abs(x[r, 5]) <= REST_SPEED / 2)
+        if doubtful[r] or not after[r, 5] < 0.0:
+            continue
+        world = worlds[r]
         level[n] = level_at(x[r, 2] - under[r, 0], world)
         height = level[n] + raised[r, 0] + world[2]
-        if doubtful[r] or not (after[r, 5] < 0.0 and after[r, 2] < height):
+        if not after[r, 2] < height:
             continue
         if not x[r, 2] > level[n] + under[r, 0] + world[2]:
             doubtful[r] = 1
@@ -293,20 +298,19 @@ def scatter(
     """Balls start (m, 9) over k steps of h s, each with its own random accelerations and kicks at bounces.
 
     Args:
-        pushes: (m, k, 3) m/s^2, in each step.  kicks: (m, 3) m/s, at a bounce; at its next one a ball has its
+        pushes: (k, m, 3) m/s^2, in each step.  kicks: (m, 3) m/s, at a bounce; at its next one a ball has its
             neighbour's.  worlds: (m, 11), as in `Carrier`.
     Writes: nodes (m, k, 3, 9): in each step the states before its first bounce, after its last one and at its end; all
         at the end without a bounce. times (m, k, 3) s, of these since the start; met (m, k, 3), bounces so far.
     """
-    m, k = len(start), pushes.shape[1]
+    m, k = len(start), len(pushes)
     all_laws, grounded = laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws), law_at(rolling, g, gt, wg)
     x, after, bounced = start.copy(), np.empty((m, 9)), np.empty(m, dtype=np.int64)
     none, calm, step, so_far = np.empty((m, 9, 0)), np.zeros((m, 0)), np.full(m, h), np.zeros(m, dtype=np.int64)
-    until, at, lies = np.empty((m, 3)), np.empty((m, 3, 9)), np.empty(m, dtype=np.bool_)
+    until, at, held = np.empty((m, 3)), np.empty((m, 3, 9)), np.empty(m, dtype=np.int64)
     for j in range(k):
-        for r in range(m):
-            lies[r] = _lies(only(all_laws.surface, r), x[r], worlds[r])
-            _push(x[r], pushes[r, j], 0.5 * h, lies[r])
+        held[:] = 0
+        _push(all_laws.surface, x, worlds, pushes[j], 0.5 * h, held)
         put_all(after, x)
         fly_together(rates, after, none, c, ct, w, step, calm, 1)
         until[:], bounced[:] = h, 0
@@ -314,10 +318,11 @@ def scatter(
         for r in range(m):
             if bounced[r]:
                 _kick(kicks[(r + so_far[r]) % m], h - until[r, 1], at[r, 1], after[r])
-            held = lies[r] or _lies(only(all_laws.surface, r), after[r], worlds[r])  # if it fell, for less than a step
-            _push(after[r], pushes[r, j], 0.5 * h, held)
+        _push(all_laws.surface, after, worlds, pushes[j], 0.5 * h, held)  # a ball that fell did for less than a step
+        for r in range(m):
             for i in range(3):
-                put(nodes[r, j, i], at[r, i] if bounced[r] and i < 2 else after[r])
+                for column in range(9):
+                    nodes[r, j, i, column] = at[r, i, column] if bounced[r] and i < 2 else after[r, column]
                 met[r, j, i] = so_far[r] + (bounced[r] if i else 0)
                 times[r, j, i] = j * h + until[r, i]
             so_far[r] += bounced[r]

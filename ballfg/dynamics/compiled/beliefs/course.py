@@ -166,7 +166,7 @@ class Scattered:
         moving = Moving(model, functions, start, 0)
         states, times, met = np.empty((n, steps, 3, STATE_DIM)), np.empty((n, steps, 3)), np.empty((n, steps, 3))
         first = np.ascontiguousarray(start[:, :STATE_DIM])
-        scatter(*moving.laws, first, h, np.ascontiguousarray(pushes), kicks, worlds, states, times, met)
+        scatter(*moving.laws, first, h, np.ascontiguousarray(pushes.swapaxes(0, 1)), kicks, worlds, states, times, met)
         raise_errors()
         nodes = (n, 3 * steps)
         return cls(
