@@ -288,13 +288,12 @@ def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
 
     Args: gradient: (d,) of the event.  rate: (d,) of the state.
     """
-    mean, covariance, closing = there.mean[0], there.covariance[0], gradient @ rate
-    time_sigma = math.inf
+    covariance, closing, time_sigma = there.covariance[0], gradient @ rate, math.inf
+    spread = covariance[:STATE_DIM, :STATE_DIM].copy()
     if closing != 0.0:
         time_by_state = -gradient / closing
-        projection = np.eye(len(mean)) + np.outer(rate, time_by_state)
+        projection = np.eye(STATE_DIM, len(rate)) + rate[:STATE_DIM, None] * time_by_state
         time_sigma = math.sqrt(max(float(time_by_state @ covariance @ time_by_state), 0.0))
-        covariance = projection @ covariance @ projection.T
-        covariance = (covariance + covariance.T) / 2
-    state, spread = mean[:STATE_DIM].copy(), covariance[:STATE_DIM, :STATE_DIM].copy()
-    return Crossing(float(there.time[0]), time_sigma, state, spread)
+        spread = projection @ covariance @ projection.T
+        spread = (spread + spread.T) / 2
+    return Crossing(float(there.time[0]), time_sigma, there.mean[0, :STATE_DIM].copy(), spread)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
 from ballfg.dynamics.motion.arrays import bounced, is_resting, place_on, surface_offsets
@@ -27,6 +27,7 @@ from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
+    from ballfg.factors.noise import ProcessNoise
     from ballfg.prediction.state import BallState
 
 PAIRS: Final = 64  # Least number of pairs of possible balls, opposite about the mean; shares are right to some 0.03
@@ -56,9 +57,11 @@ def event_on(path: Path, asked: Plane | str) -> EventAhead:
         return EventAhead(*contact_ahead(path))
     line = Line.of(asked)
     found, alike = path.mean_event(line)
-    if found is None or not alike:
-        return EventAhead(found and path.of_all(found, line), _chance_of(path, line))
-    return EventAhead(found, _sooner(found, path.start.time + path.horizon - found.time))
+    shown = found if found is None or alike else path.of_all(found, line)
+    torn = line.after > 0 and path.start.other_side is not None  # balls have bounced just now, or have not
+    if found is None or not alike or torn:
+        return EventAhead(shown, _chance_of(path, line))
+    return EventAhead(shown, _sooner(found, path.start.time + path.horizon - found.time))
 
 
 def contact_ahead(path: Path) -> tuple[Crossing | None, float]:
@@ -188,6 +191,22 @@ def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
     return belief.within_bounds(start)
 
 
+@lru_cache(maxsize=8)
+def _chance(
+    pairs: int, horizon: float, process: ProcessNoise, edge_sigmas: tuple[float, float, float, float]
+) -> tuple[Array, Array, Array]:
+    """What happens to possible balls by chance: pushes, kicks and ends, as `Scattered.of` takes them."""
+    noise = density_of(process)
+    steps = max(math.ceil(horizon / STEP - 1e-9), 1)
+    ends = np.maximum(np.geomspace(1, steps, min(SPANS, steps)).round(), 1.0 + np.arange(min(SPANS, steps)))
+    spans = np.searchsorted(ends, np.arange(steps), side="right")  # of lasting pushes, by step
+    h, lasting = horizon / steps, np.bincount(spans)
+    kicks, sides, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
+    pushes = pushed.reshape(2 * pairs, SPANS, 3)[:, : len(lasting)] * (noise[0] / np.sqrt(h * lasting))[:, None]
+    off = sides * edge_sigmas if any(edge_sigmas) else np.zeros_like(sides)
+    return plain(pushes[:, spans].swapaxes(0, 1)), kicks * noise[[3, 3, 2]], off
+
+
 @dataclass(frozen=True, eq=False)
 class Line:
     """An event at which a line of the state goes through an offset: an apex, or the crossing of a plane.
@@ -246,18 +265,11 @@ class Path:
     def possible(self) -> Scattered:
         """Paths of possible balls: at starts that the belief holds, with random accelerations, kicks and ends."""
         (propagator, belief), horizon = self.carried, min(self.horizon, LONGEST_MOTION)
-        noise, surfaces, d = density_of(propagator.noise), propagator.surfaces, belief.mean.shape[1]
-        pairs = max(PAIRS, d)
-        steps = max(math.ceil(horizon / STEP - 1e-9), 1)
-        ends = np.maximum(np.geomspace(1, steps, min(SPANS, steps)).round(), 1.0 + np.arange(min(SPANS, steps)))
-        spans = np.searchsorted(ends, np.arange(steps), side="right")  # of lasting pushes, by step
-        h, lasting = horizon / steps, np.bincount(spans)
-        kicks, sides, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
-        pushes = pushed.reshape(2 * pairs, SPANS, 3)[:, : len(lasting)] * (noise[0] / np.sqrt(h * lasting))[:, None]
-        off = sides * surfaces.edge_sigmas if any(surfaces.edge_sigmas) else np.zeros_like(sides)
-        start = _placed(belief, normal_points(pairs, d) @ root_of(belief.covariance[0]).T, surfaces)
-        chance = (pushes[:, spans], kicks * noise[[3, 3, 2]], off)
-        return Scattered.of(belief.model, start, h, chance, surfaces)
+        surfaces, pairs = propagator.surfaces, max(PAIRS, belief.mean.shape[1])
+        chance = _chance(pairs, horizon, propagator.noise, surfaces.edge_sigmas)
+        errors = normal_points(pairs, belief.mean.shape[1]) @ root_of(belief.covariance[0]).T
+        start = _placed(belief, errors, surfaces)
+        return Scattered.of(belief.model, start, horizon / len(chance[0]), chance, surfaces)
 
     @cached_property
     def _contacts(self) -> list[Crossing | None]:

@@ -35,7 +35,7 @@ def test_possible_balls_bounce_on_a_table_that_leans(tilt):
     model = AnalyticModel([*(EFFECTS[name]() for name in effects), EFFECTS["table_tilt"](y=tilt)])
     start = FALLING + np.array([0.02] * 3 + [0.5] * 3 + [50.0] * 3) * np.random.default_rng(9).standard_normal((100, 9))
     start[:, 2] += 0.2
-    calm = np.zeros((100, 6, 3)), np.zeros((100, 3)), np.zeros((100, 4))
+    calm = np.zeros((6, 100, 3)), np.zeros((100, 3)), np.zeros((100, 4))
     balls = Scattered.of(model.requires_grad_(False), start, 0.08, calm, Surfaces(0.0))
     times = 0.08 * torch.arange(1, 7, dtype=torch.float64)
     exact = rollout(model, torch.from_numpy(start), times, Surfaces(0.0)).numpy()
@@ -50,7 +50,7 @@ def test_possible_balls_move_as_every_other_ball_does(world, surfaces):
     start = FALLING + np.array([0.1] * 3 + [2.0] * 3 + [100.0] * 3) * rng.standard_normal((400, 9))
     start[::4, 2:6] *= [0.1, 0.1, 0.1, 0.0]
     start[:, 2] = np.abs(start[:, 2]) + 0.03
-    calm = np.zeros((400, steps, 3)), np.zeros((400, 3)), np.zeros((400, 4))
+    calm = np.zeros((steps, 400, 3)), np.zeros((400, 3)), np.zeros((400, 4))
     balls = Scattered.of(world.model, start, step, calm, surfaces)
     times = step * torch.arange(1, steps + 1, dtype=torch.float64)
     exact = rollout(world.model, torch.from_numpy(start), times, surfaces).numpy()

@@ -149,7 +149,7 @@ def test_possible_balls_roll_together_as_each_does_alone():
     start[:, 3:5], start[:, 6:] = rng.normal(0.0, 0.5, (60, 2)), rng.normal(0.0, 30.0, (60, 3))
     start[50:55, 0], start[50:55, 2] = 0.9, 0.017 - 0.76
     start[55:, 2] += 0.2
-    chance = np.zeros((60, steps, 3)), np.zeros((60, 3)), np.zeros((60, 4))
+    chance = np.zeros((steps, 60, 3)), np.zeros((60, 3)), np.zeros((60, 4))
     balls = Scattered.of(model, start, h, chance, edge)
     times = h * torch.arange(1, steps + 1).double()
     alone = np.stack([rollout(model, torch.from_numpy(one[None]), times, edge)[0].numpy() for one in start])

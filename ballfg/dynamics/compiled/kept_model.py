@@ -188,6 +188,10 @@ class KeptModel:
 
     def declared_coefficients(self) -> dict[str, Coefficient]:
         """Declarations of its coefficients by name."""
+        return dict(self._declared)
+
+    @cached_property
+    def _declared(self) -> dict[str, Coefficient]:
         return {name: Coefficient(**one) for name, one in self._facts["coefficients"].items()}
 
     def inside(self, states: object) -> None:

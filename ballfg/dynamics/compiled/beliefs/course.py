@@ -157,16 +157,16 @@ class Scattered:
         """The paths from start (n, 9 + p) on, in steps of h s.
 
         Args:
-            chance: pushes (n, steps, 3) m/s^2, kicks (n, 3) m/s and by how far the ends of the table are off (n, 4) m.
+            chance: pushes (steps, n, 3) m/s^2, kicks (n, 3) m/s and by how far the ends of the table are off (n, 4) m.
         """
         pushes, kicks, ends = chance
-        functions, (n, steps) = functions_for(model), pushes.shape[:2]
+        functions, (steps, n) = functions_for(model), pushes.shape[:2]
         worlds = np.tile(world_of(surfaces, functions.radius), (n, 1))
         worlds[:, ENDS] += ends
         moving = Moving(model, functions, start, 0)
         states, times, met = np.empty((n, steps, 3, STATE_DIM)), np.empty((n, steps, 3)), np.empty((n, steps, 3))
         first = np.ascontiguousarray(start[:, :STATE_DIM])
-        scatter(*moving.laws, first, h, np.ascontiguousarray(pushes.swapaxes(0, 1)), kicks, worlds, states, times, met)
+        scatter(*moving.laws, first, h, pushes, kicks, worlds, states, times, met)
         raise_errors()
         nodes = (n, 3 * steps)
         return cls(
