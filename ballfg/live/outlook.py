@@ -15,8 +15,9 @@ from ballfg.estimation.result import Status
 from ballfg.live.tracker import BallUpdate
 from ballfg.prediction import BallState
 from ballfg.prediction.crossing import Crossing
-from ballfg.prediction.event_ahead import EventAhead, Path, contact_ahead, event_on
+from ballfg.prediction.event_ahead import EventAhead, contact_ahead, event_on
 from ballfg.prediction.forecast import carried_by
+from ballfg.prediction.path import Path
 from ballfg.prediction.plane import APEX, CONTACT, Plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 

@@ -1,46 +1,25 @@
 """Answers how probable an event ahead is: a contact, an apex, or the crossing of a plane within the horizon.
 
-An event is a number that goes through zero: the vertical velocity, the distance from a plane. A sample of possible
-balls is moved through bounces and past edges, and those that have the event are counted. A ball that may miss a plane
-has an event with a small probability, or none on its mean path.
+An event is a number that goes through zero: the vertical velocity, the distance from a plane. Where all balls have it
+as the mean's neighbours do, only its time is in doubt. Elsewhere, as for a plane that a ball may miss, possible balls
+are moved through bounces and past edges, and those that have the event are counted.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, plain
-from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
-from ballfg.dynamics.compiled.beliefs.mixture import FAR
-from ballfg.dynamics.motion.arrays import bounced, is_resting, place_on, surface_offsets
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
-from ballfg.dynamics.surfaces import Surfaces
-from ballfg.prediction.belief import Belief, normal_points, root_of
-from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
-from ballfg.prediction.plane import APEX, AXES, CONTACT, Plane
-from ballfg.prediction.propagate import Propagator
+from ballfg.dynamics.motion.arrays import bounced
+from ballfg.prediction.crossing import Crossing
+from ballfg.prediction.path import LATER, Line, Path, may_pass_an_end, spread_over
+from ballfg.prediction.plane import AXES, CONTACT, Plane
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
-if TYPE_CHECKING:
-    from ballfg.factors.noise import ProcessNoise
-    from ballfg.prediction.state import BallState
-
-PAIRS: Final = 64  # Least number of pairs of possible balls, opposite about the mean; shares are right to some 0.03
-STEP: Final = 0.08  # s, longest step of a possible ball; at 20 m/s its place is right to 0.2 mm after one
-SPANS: Final = 8
-"""Number of parts of the horizon in which a possible ball has a random acceleration each. A later part is longer: up to
-10 s ahead it lasts at most a step longer than the time before it, else balls lie too close together in it."""
-LATER: Final = 1.0
-"""s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce
-TOP: Final = np.eye(STATE_DIM)[VZ]  # An apex is a fall of this line (9,) . state through zero
-UP: Final = np.eye(3)[2]  # Normal of the table's plane
-Carried: TypeAlias = tuple[Propagator, Belief]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +52,7 @@ def contact_ahead(path: Path) -> tuple[Crossing | None, float]:
     """
     found, end = path.contact(), path.start.time + path.horizon
     chance = 0.0 if found is None else _sooner(found, end - found.time)
-    if _may_pass_an_end(path, found):
+    if may_pass_an_end(path, found):
         found, chance = _past_or_not(path, found, chance)
     share, other = _other_contact(path, found)
     if other is not None:
@@ -83,25 +62,6 @@ def contact_ahead(path: Path) -> tuple[Crossing | None, float]:
             time_sigma = math.hypot(found.time_sigma, math.sqrt(share) * late)
             found = replace(found, time_sigma=time_sigma, covariance=found.covariance + share * np.outer(off, off))
     return (None if found is None or found.time > end else found), chance
-
-
-def _may_pass_an_end(path: Path, found: Crossing | None, since: float = -math.inf, until: float = math.inf) -> bool:
-    """Whether some balls may come down on the table and others past its ends, before a time (s).
-
-    Args: found: the mean's first contact after a time `since`, s.
-    """
-    propagator, belief = path.carried
-    surfaces, (extent, top) = propagator.surfaces, (propagator.surfaces.extent, propagator.surfaces.table_height)
-    if extent is None or not path.start.state[Z] > top:
-        return False
-    if found is None or not found.state[Z] > top:  # where the mean falls past the table, if it does
-        level = top + belief.model.radius
-        found = plane_crossing(*path.carried, UP, level, path.horizon + LATER, after=since, direction="down")
-    if found is None:
-        return True
-    near = FAR * np.hypot(np.sqrt(np.diagonal(found.covariance)[:2]).repeat(2), surfaces.edge_sigmas)
-    sooner = found.time - FAR * found.time_sigma < until
-    return sooner and bool((np.abs(found.state[:2].repeat(2) - extent) < near).any())
 
 
 def _past_or_not(path: Path, found: Crossing | None, chance: float) -> tuple[Crossing | None, float]:
@@ -116,14 +76,8 @@ def _past_or_not(path: Path, found: Crossing | None, chance: float) -> tuple[Cro
         return found, chance
     chance = float((times <= path.horizon).sum() / len(bounces))
     if found is not None and len(rows):
-        found = _spread_over(found, states, times - (found.time - path.start.time))
+        found = spread_over(found, states, times - (found.time - path.start.time))
     return found, chance
-
-
-def _spread_over(found: Crossing, states: Array, late: Array) -> Crossing:
-    """The mean's event with the covariance of possible balls about it: states (m, 9), late (m,) s after the mean."""
-    off = states - found.state
-    return replace(found, time_sigma=math.sqrt(float((late**2).mean())), covariance=off.T @ off / len(off))
 
 
 def _sooner(found: Crossing, left: float) -> float:
@@ -178,201 +132,3 @@ def event_numbers(found: Crossing | None) -> dict[str, float]:
     numbers |= {"speed": speed, **dict(zip(("sigma_x", "sigma_y", "sigma_z"), sigmas.tolist(), strict=True))}
     numbers |= {"sigma_speed": float(np.sqrt(along @ spread[VELOCITY, VELOCITY] @ along))}
     return numbers | {f"cov_{AXES[i]}{AXES[j]}": float(spread[i, j]) for i, j in ((0, 1), (0, 2), (1, 2))}
-
-
-def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
-    """States and coefficients (n, 9 + p) at some errors; if the mean lies on a surface, so do all."""
-    mean, model = belief.mean, belief.model
-    start = mean + errors
-    if abs(float(mean[0, VZ])) <= REST_SPEED:
-        level = surfaces.level_below(mean, surface_offsets(model, mean))
-        if is_resting(model, mean, level)[0]:
-            start = place_on(model, start, float(level[0]))
-    return belief.within_bounds(start)
-
-
-@lru_cache(maxsize=8)
-def _chance(
-    pairs: int, horizon: float, process: ProcessNoise, edge_sigmas: tuple[float, float, float, float]
-) -> tuple[Array, Array, Array]:
-    """What happens to possible balls by chance: pushes, kicks and ends, as `Scattered.of` takes them."""
-    noise = density_of(process)
-    steps = max(math.ceil(horizon / STEP - 1e-9), 1)
-    ends = np.maximum(np.geomspace(1, steps, min(SPANS, steps)).round(), 1.0 + np.arange(min(SPANS, steps)))
-    spans = np.searchsorted(ends, np.arange(steps), side="right")  # of lasting pushes, by step
-    h, lasting = horizon / steps, np.bincount(spans)
-    kicks, sides, pushed = np.split(normal_points(pairs, 7 + 3 * SPANS, seed=1), [3, 7], axis=1)
-    pushes = pushed.reshape(2 * pairs, SPANS, 3)[:, : len(lasting)] * (noise[0] / np.sqrt(h * lasting))[:, None]
-    off = sides * edge_sigmas if any(edge_sigmas) else np.zeros_like(sides)
-    return plain(pushes[:, spans].swapaxes(0, 1)), kicks * noise[[3, 3, 2]], off
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """An event at which a line of the state goes through an offset: an apex, or the crossing of a plane.
-
-    Attributes:
-        normal: (9,), offset: the ball has the event where normal . state is the offset.
-        direction: `up`, `down` or `either`.  after: number of bounces before it.
-    """
-
-    normal: Array
-    offset: float
-    direction: str
-    after: int
-
-    @classmethod
-    def of(cls, asked: Plane | str) -> Line:
-        """The line of a plane; of `apex` for any text."""
-        if not isinstance(asked, Plane):
-            return cls(TOP, 0.0, "down", 0)
-        normal, (towards, place) = np.zeros(STATE_DIM), asked.line
-        normal[POSITION] = towards
-        return cls(normal, place, asked.direction, asked.after)
-
-    @property
-    def is_apex(self) -> bool:
-        """True for an apex."""
-        return bool(self.normal[VZ])
-
-    def value(self, states: Array) -> Array:
-        """(...) line . state beyond the offset, of states (..., 9)."""
-        return np.asarray(states @ self.normal - self.offset)
-
-    def find(self, propagator: Propagator, belief: Belief, horizon: float, since: float) -> Crossing | None:
-        """The mean ball's first event after a time, s."""
-        if self.is_apex:
-            return apex(propagator, belief, horizon, after=since)
-        line = self.normal[POSITION], self.offset
-        return plane_crossing(propagator, belief, *line, horizon, after=since, direction=self.direction)
-
-    def may_turn(self, found: Crossing) -> bool:
-        """Whether some balls may not be fast enough to cross where the mean does; all balls fall at an apex."""
-        normal = self.normal[POSITION]
-        variance = normal @ found.covariance[VELOCITY, VELOCITY] @ normal
-        return abs(float(normal @ found.state[VELOCITY])) <= FAR * math.sqrt(max(variance, 0.0)) and not self.is_apex
-
-
-@dataclass(frozen=True)
-class Path:
-    """The way of a ball ahead: what carries it on from the start, up to a horizon, s."""
-
-    start: BallState
-    carried: Carried
-    horizon: float
-
-    @cached_property
-    def possible(self) -> Scattered:
-        """Paths of possible balls: at starts that the belief holds, with random accelerations, kicks and ends."""
-        (propagator, belief), horizon = self.carried, min(self.horizon, LONGEST_MOTION)
-        surfaces, pairs = propagator.surfaces, max(PAIRS, belief.mean.shape[1])
-        chance = _chance(pairs, horizon, propagator.noise, surfaces.edge_sigmas)
-        errors = normal_points(pairs, belief.mean.shape[1]) @ root_of(belief.covariance[0]).T
-        start = _placed(belief, errors, surfaces)
-        return Scattered.of(belief.model, start, horizon / len(chance[0]), chance, surfaces)
-
-    @cached_property
-    def _contacts(self) -> list[Crossing | None]:
-        """The mean ball's contacts as far as they have been searched; None after the last one."""
-        return []
-
-    def contact(self, after: float = -math.inf) -> Crossing | None:
-        """The mean ball's first contact later than a time, s, until `LATER` beyond the horizon; searched once."""
-        known = self._contacts
-        while not known or (known[-1] is not None and known[-1].time <= after):
-            since = known[-1].time if known and known[-1] is not None else -math.inf
-            known.append(next_contact(*self.carried, self.horizon + LATER, after=since))
-        return next((one for one in known if one is None or one.time > after), None)
-
-    def crossing(self, plane: Plane) -> Crossing | None:
-        """The crossing of a plane by the mean ball, with the covariance of all balls about it that have one."""
-        return self._event(Line.of(plane))
-
-    def apex(self) -> Crossing | None:
-        """The next highest point of the mean ball, with the covariance of all balls about it that have one."""
-        return self._event(Line.of(APEX))
-
-    def _event(self, line: Line) -> Crossing | None:
-        found, alike = self.mean_event(line)
-        return found if found is None or alike else self.of_all(found, line)
-
-    def mean_event(self, line: Line) -> tuple[Crossing | None, bool]:
-        """The mean ball's event, and whether all balls have it as its neighbours do: sooner or later, near its place.
-
-        Near a bounce some have it before and others after; some have had it just now, and have it again later or in
-        the other direction; by an end of the table some meet the table and others do not; some turn before a plane.
-        """
-        since = -math.inf
-        for _ in range(line.after):
-            contact = self.contact(since)
-            if contact is None:
-                return None, False
-            since = contact.time
-        found = line.find(*self.carried, self.horizon, since)
-        alike = found is not None and not (self._apart(found, line) or self._near_a_bounce(found, line))
-        return found, alike
-
-    def of_all(self, found: Crossing, line: Line) -> Crossing:
-        """The mean's event with the moments of possible balls that have one; itself if they bounce as often before."""
-        times, states, met = self._events(line)
-        if len(met) == 0 or not (self._apart(found, line) or (met != met[0]).any()):
-            return found
-        return _spread_over(found, states, times - (found.time - self.start.time))
-
-    def _apart(self, found: Crossing, line: Line) -> bool:
-        """Whether some balls may have another event than the mean, or none, even if they bounce as often before."""
-        until = found.time + FAR * found.time_sigma
-        return self._just_now(line) or line.may_turn(found) or self._by_an_end(until)
-
-    def _just_now(self, line: Line) -> bool:
-        """Whether some balls may be on the other side of an event than the mean at the start."""
-        belief, own = self.carried[1], slice(STATE_DIM)  # without the other side of a contact
-        variance = line.normal @ belief.covariance[0, own, own] @ line.normal
-        return bool(abs(line.value(self.start.state)) < FAR * math.sqrt(max(variance, 0.0)))
-
-    def _near_a_bounce(self, found: Crossing, line: Line) -> bool:
-        """Whether some balls may have bounced at an event, and others not."""
-        about = FAR * found.time_sigma
-        if not line.is_apex:
-            speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
-            about += FAR * math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed
-        contact = self.contact(found.time - about)
-        return contact is not None and contact.time <= found.time + about
-
-    def _by_an_end(self, until: float) -> bool:
-        """Whether by a time (s) some balls may meet the table where the mean falls past it, or the reverse."""
-        since = -np.inf
-        while since < until:
-            contact = self.contact(since)
-            if _may_pass_an_end(self, contact, since, until):
-                return True
-            since = np.inf if contact is None else contact.time
-        return False
-
-    def _events(self, line: Line) -> tuple[Array, Array, Array]:
-        """Times (m,) s since the start, states (m, 9) and numbers of bounces (m,) of the balls that have an event."""
-        balls, above = self.possible, line.value(self.possible.states) > 0.0
-        crossed = (above[:, :-1] != above[:, 1:]) & (balls.met[:, :-1] >= line.after)
-        if line.direction != "either":
-            crossed &= above[:, :-1] == (line.direction == "down")
-        rows = np.flatnonzero(crossed.any(axis=1))
-        at = crossed[rows].argmax(axis=1)
-        plane = line.normal[POSITION], line.offset
-        times, states = balls.topped(rows, at) if line.is_apex else balls.crossed(rows, at, *plane)
-        return times, states, balls.met[rows, at]
-
-    def probability(self, line: Line) -> float:
-        """Share of balls whose line . state goes through the offset in a direction, after a number of bounces."""
-        balls = self.possible
-        value, rate = line.value(balls.states), balls.states[..., VELOCITY] @ line.normal[POSITION]
-        before, later = rate[:, :-1], rate[:, 1:]
-        turns = before * later < 0.0  # the highest or lowest point between two moments, of a parabola
-        turn = np.where(turns, 0.5 * before**2 * np.diff(balls.times) / np.where(turns, before - later, 1.0), 0.0)
-        values = np.empty((len(value), 2 * value.shape[1] - 1))
-        values[:, ::2], values[:, 1::2] = value, value[:, :-1] + turn
-        counts = np.repeat(balls.met >= line.after, 2, axis=1)[:, :-1]
-        first, then = (values > 0.0) & counts, (values < 0.0) & counts
-        if line.direction == "either":
-            return float((first.any(axis=1) & then.any(axis=1)).mean())
-        first, then = (then, first) if line.direction == "up" else (first, then)
-        return float((np.maximum.accumulate(first, axis=1) & then).any(axis=1).mean())

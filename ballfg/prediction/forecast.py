@@ -11,7 +11,8 @@ from ballfg.checks import check_number, check_text
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing
-from ballfg.prediction.event_ahead import Carried, EventAhead, Path, contact_ahead, event_on
+from ballfg.prediction.event_ahead import EventAhead, contact_ahead, event_on
+from ballfg.prediction.path import Carried, Path
 from ballfg.prediction.plane import AXES, Plane, asked_event
 from ballfg.prediction.propagate import Propagator
 from ballfg.prediction.state import BallState

@@ -13,8 +13,9 @@ from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState, Plane, next_contact, plane_crossing
-from ballfg.prediction.event_ahead import PAIRS, EventAhead, event_numbers
+from ballfg.prediction.event_ahead import EventAhead, event_numbers
 from ballfg.prediction.forecast import carried_by
+from ballfg.prediction.path import PAIRS
 from ballfg.prediction.state import World
 from ballfg.state import POSITION, VZ
 from tests.prediction.conftest import FALLING, NEARLY_EXACT

@@ -12,8 +12,9 @@ from ballfg.dynamics.compiled.beliefs.course import Scattered
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState
-from ballfg.prediction.event_ahead import PAIRS, Path, normal_points
+from ballfg.prediction.belief import normal_points
 from ballfg.prediction.forecast import carried_by
+from ballfg.prediction.path import PAIRS, Path
 from ballfg.prediction.state import World
 from ballfg.state import VZ
 from tests.prediction.conftest import FALLING
