@@ -179,10 +179,10 @@ def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
     Returns: squared whitened innovation, as of a good sample, of the hypothesis that is the best afterwards.
     """
     bank, n, best, surprise = work.bank, work.fill[USED], -math.inf, 0.0
-    evidence = np.empty((n - first, 4))
+    position, sigma, evidence = sample.position, sample.sigma, np.empty((n - first, 4))
     for row in range(first, n):
         said = evidence[row - first]
-        weigh(bank[row], sample.position, sample.sigma, scene, said)
+        weigh(bank[row], position, sigma, scene, said)
         for component in range(3):
             if bank[row].score + said[component] > best:
                 best, surprise = bank[row].score + said[component], said[SURPRISE]
@@ -197,7 +197,7 @@ def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
             lost = bank[add(work, bank, row)]
             lost.score += said[AS_OUTLIER]
             pass_through(lost, work, OUTLIER, sample.number, -1, sample.time)
-        _take_in(bank[row], sample.position, sample.sigma, component, scene)
+        _take_in(bank[row], position, sigma, component, scene)
         bank[row].score += said[component]
         if component != AS_GOOD:
             kind = WIDE if component == AS_WIDE else OUTLIER
@@ -205,26 +205,30 @@ def update(work: Work, first: int, sample: Sample, scene: Record) -> float:
     return surprise
 
 
-@machine_code(REAL(ONE_HYPOTHESIS, COUNT, REAL, COUNT, SCENE))
-def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record) -> float:
-    """m^2, of the innovation of one coordinate, for a sample of a component."""
+@machine_code(REAL(REAL, REAL, REAL, COUNT, SCENE))
+def _variance(known: float, speed: float, sigma: float, component: int, scene: Record) -> float:
+    """m^2, of the innovation of one coordinate, for a sample of a component.
+
+    Args: known: m^2, of the coordinate before the sample.  speed: m/s, along it.  sigma: m, of the sample.
+    """
     if component == AS_OUTLIER:
-        return h.cov[axis, 0, 0] + scene.outlier_spread**2
-    noise = (scene.stamp_jitter * h.mean[axis, 1]) ** 2 + sigma**2
-    return h.cov[axis, 0, 0] + (noise * scene.wide_factor**2 if component == AS_WIDE else noise)
+        return known + scene.outlier_spread**2
+    noise = (scene.stamp_jitter * speed) ** 2 + sigma**2
+    return known + (noise * scene.wide_factor**2 if component == AS_WIDE else noise)
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
 def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
     """Writes a sample's evidence: (4,) nats, less 3/2 log 2 pi, if good, wide, outlier; and the squared innovation."""
+    mean, cov, shares = h.mean, h.cov, scene.log_shares  # once: numba counts who holds them, which takes longer
     for component in range(3):
         volume, distance = 1.0, 0.0
         for axis in range(3):
-            off = position[axis] - h.mean[axis, 0]
-            spread = _variance(h, axis, sigma[axis], component, scene)
+            off = position[axis] - mean[axis, 0]
+            spread = _variance(cov[axis, 0, 0], mean[axis, 1], sigma[axis], component, scene)
             volume *= spread
             distance += off * off / spread
-        said[component] = scene.log_shares[component] - 0.5 * (distance + math.log(volume))
+        said[component] = shares[component] - 0.5 * (distance + math.log(volume))
         if component == AS_GOOD:
             said[SURPRISE] = distance
 
@@ -235,16 +239,16 @@ def _take_in(h: Record, position: Array, sigma: Array, component: int, scene: Re
     if component == AS_OUTLIER:
         return
     h.age += 1
-    gain, first = np.empty(3), np.empty(3)
+    mean, cov = h.mean, h.cov
     for axis in range(3):
-        spread = _variance(h, axis, sigma[axis], component, scene)
-        off = position[axis] - h.mean[axis, 0]
+        spread = _variance(cov[axis, 0, 0], mean[axis, 1], sigma[axis], component, scene)
+        off = position[axis] - mean[axis, 0]
+        gain = (cov[axis, 0, 0] / spread, cov[axis, 1, 0] / spread, cov[axis, 2, 0] / spread)
+        first = (cov[axis, 0, 0], cov[axis, 0, 1], cov[axis, 0, 2])
         for i in range(3):
-            gain[i], first[i] = h.cov[axis, i, 0] / spread, h.cov[axis, 0, i]
-        for i in range(3):
-            h.mean[axis, i] += gain[i] * off
+            mean[axis, i] += gain[i] * off
             for k in range(3):
-                h.cov[axis, i, k] -= gain[i] * first[k]
+                cov[axis, i, k] -= gain[i] * first[k]
 
 
 @machine_code(NOTHING(BANK, COUNT, COUNT, COUNTS))
