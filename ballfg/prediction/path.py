@@ -79,7 +79,7 @@ class Line:
     def may_turn(self, found: Crossing) -> bool:
         """Whether some balls may not be fast enough to cross where the mean does; all balls fall at an apex."""
         normal = self.normal[POSITION]
-        variance = normal @ found.covariance[VELOCITY, VELOCITY] @ normal
+        variance = float(normal @ found.covariance[VELOCITY, VELOCITY] @ normal)
         return abs(float(normal @ found.state[VELOCITY])) <= FAR * math.sqrt(max(variance, 0.0)) and not self.is_apex
 
 
@@ -157,7 +157,7 @@ class Path:
     def _just_now(self, line: Line) -> bool:
         """Whether some balls may be on the other side of an event than the mean at the start."""
         belief, own = self.carried[1], slice(STATE_DIM)  # without the other side of a contact
-        variance = line.normal @ belief.covariance[0, own, own] @ line.normal
+        variance = float(line.normal @ belief.covariance[0, own, own] @ line.normal)
         return bool(abs(line.value(self.start.state)) < FAR * math.sqrt(max(variance, 0.0)))
 
     def _near_a_bounce(self, found: Crossing, line: Line) -> bool:

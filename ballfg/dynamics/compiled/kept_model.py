@@ -318,10 +318,10 @@ def keep(about: str, model: BallModel) -> None:
     from ballfg.dynamics.compiled.functions import compiled, is_of_package
     from ballfg.dynamics.model_file import model_to_dict
 
-    plain = type(model) is AnalyticModel and model.trained is None and model.measures_plainly and not model.random
-    if not plain or not is_of_package(model) or (functions := compiled(model)) is None:
+    if type(model) is not AnalyticModel:
         return
-    if numbers_of(model).arrays:
+    plain = model.trained is None and model.measures_plainly and not model.random and is_of_package(model)
+    if not plain or numbers_of(model).arrays or (functions := compiled(model)) is None:
         return
     described = {name: getattr(model, name) for name in MAPPINGS}
     facts = {
