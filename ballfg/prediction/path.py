@@ -139,7 +139,7 @@ class Path:
                 return None, False
             since = contact.time
         found = line.find(*self.carried, self.horizon, since)
-        alike = found is not None and not (self._apart(found, line) or self._near_a_bounce(found, line))
+        alike = found is not None and not (self._apart(found, line) or self._near_a_bounce(found))
         return found, alike
 
     def of_all(self, found: Crossing, line: Line) -> Crossing:
@@ -160,14 +160,17 @@ class Path:
         variance = float(line.normal @ belief.covariance[0, own, own] @ line.normal)
         return bool(abs(line.value(self.start.state)) < FAR * math.sqrt(max(variance, 0.0)))
 
-    def _near_a_bounce(self, found: Crossing, line: Line) -> bool:
+    def _near_a_bounce(self, found: Crossing) -> bool:
         """Whether some balls may have bounced at an event, and others not."""
-        about = FAR * found.time_sigma
-        if not line.is_apex:
-            speed = max(abs(float(found.state[VZ])), np.finfo(float).tiny)
-            about += FAR * math.sqrt(max(float(found.covariance[Z, Z]), 0.0)) / speed
-        contact = self.contact(found.time - about)
-        return contact is not None and contact.time <= found.time + about
+        about, since = FAR * found.time_sigma, -math.inf
+        while (contact := self.contact(since)) is not None:
+            reach = about + FAR * contact.time_sigma
+            if abs(contact.time - found.time) <= reach:
+                return True
+            if contact.time > found.time:
+                return False
+            since = contact.time
+        return False
 
     def _by_an_end(self, until: float) -> bool:
         """Whether by a time (s) some balls may meet the table where the mean falls past it, or the reverse."""

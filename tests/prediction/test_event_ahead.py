@@ -13,9 +13,9 @@ from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState, Plane, next_contact, plane_crossing
-from ballfg.prediction.event_ahead import EventAhead, event_numbers
+from ballfg.prediction.event_ahead import EventAhead, event_numbers, event_on
 from ballfg.prediction.forecast import carried_by
-from ballfg.prediction.path import PAIRS
+from ballfg.prediction.path import PAIRS, Line
 from ballfg.prediction.state import World
 from ballfg.state import POSITION, VZ
 from tests.prediction.conftest import FALLING, NEARLY_EXACT
@@ -137,6 +137,32 @@ def test_the_probability_of_a_contact_is_that_of_its_time(start, drawn, horizon)
     steps = round(horizon / HORIZON * STEPS)
     bounced = (np.diff(np.sign(drawn[: steps + 1, :, VZ]), axis=0) > 0).any(axis=0).mean()
     assert start.predict(horizon, 0.005).event("next-contact").probability == pytest.approx(bounced, abs=0.06)
+
+
+@pytest.mark.parametrize("late", [-1.0, 0.5, 2.0])
+def test_where_all_balls_cross_alike_their_time_alone_is_in_doubt(start, drawn, late):
+    """A plane across the way, above the table: no ball has to be drawn, and drawn ones agree."""
+    plane = Plane((1.0, 0.0, 0.0), 0.9)
+    expected = start.predict(HORIZON).crossing(x=0.9)
+    horizon = expected.time + late * expected.time_sigma
+    path = start.predict(horizon).path()
+    event = event_on(path, plane)
+    assert (event.crossing is None) == (late < 0.0)
+    assert ("possible" in vars(path)) == (late < 0.0)  # the mean does not get there: balls are counted
+    steps = round(horizon / HORIZON * STEPS)
+    assert event.probability == pytest.approx(share(0.9 - drawn[: steps + 1, :, 0]), abs=0.05)
+    assert event.probability == pytest.approx(path.probability(Line.of(plane)), abs=0.05)
+
+
+def test_a_plane_that_balls_may_not_reach_has_the_moments_of_those_that_do(start, drawn):
+    """A little below the highest point, where some turn before it: the mean's neighbours alone are 0.05 s off."""
+    height = start.predict(HORIZON).apex.state[2] - 0.01
+    found = start.predict(HORIZON).crossing(z=height, direction="up")
+    above = drawn[..., 2] > height
+    crossed = ~above[:-1] & above[1:]
+    times = np.linspace(0.0, HORIZON, STEPS + 1)[1:][crossed.argmax(axis=0)][crossed.any(axis=0)]
+    spread = np.sqrt(((times - found.time) ** 2).mean())
+    assert found.time_sigma == pytest.approx(spread, rel=0.1)
 
 
 def test_a_plane_that_is_never_met_in_that_direction_has_no_chance(start):
