@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 EventFunction = Callable[["Tensor"], "Tensor"]
 """(..., d) states to (..., 1) values, in torch; the event is where the value falls through zero."""
-_Event = Callable[[Array], tuple[Array, Array]]
-"""States (k, d) to an event's values (k,) and their gradients (k, d)."""
 SearchStep = Callable[[Belief, float, float], tuple["Crossing | None", Belief]]
 """From a belief, the end of a search and the time (s) from which events count to an event and the belief then."""
 
@@ -42,6 +40,13 @@ Search = Callable[..., tuple[float, Belief, Array, Array]]
 """As `Propagator.search`, of a belief, a horizon and the time from which events count."""
 VALUE_JUMP = 1e-6  # Largest value, in the event's own unit, of a crossing; a larger one jumped through zero in a bounce
 JUST_NOW = 1e-9  # s. Least delay of a new event after the time from which events count
+
+
+class _Event(NamedTuple):
+    """An event on arrays: states (k, d) to its values (k,), and to their gradients (k, d)."""
+
+    values: Callable[[Array], Array]
+    gradients: Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +140,7 @@ def _line_crossing(
     gradient, offset = np.zeros(belief.mean.shape[1]), line[1]
     gradient[:STATE_DIM] = line[0]
 
-    def event(states: Array) -> tuple[Array, Array]:
-        return states @ gradient - offset, np.tile(gradient, (len(states), 1))
+    event = _Event(lambda states: states @ gradient - offset, lambda states: np.tile(gradient, (len(states), 1)))
 
     step = partial(_crossing_step, propagator, event, either_way)
     return _first(belief, horizon, after, step, partial(propagator.search, line=line, either_way=either_way))
@@ -162,17 +166,23 @@ def next_crossing(
     Returns: None if there is no crossing within the horizon.
     Raises: ValueError: if the belief does not hold exactly one ball, or the horizon is not a positive number of s.
     """
-    return _first(belief, horizon, after, partial(_crossing_step, propagator, partial(_valued, event), either_way))
+    return _first(belief, horizon, after, partial(_crossing_step, propagator, _in_torch(event), either_way))
 
 
-def _valued(event: EventFunction, states: Array) -> tuple[Array, Array]:
-    """Values (k,) and gradients (k, d) of an event that torch computes, of states (k, d)."""
+def _in_torch(event: EventFunction) -> _Event:
+    """An event that torch computes."""
     import torch
 
     from ballfg.dynamics.motion.integrate import batch_jacobian
 
-    values, gradients = batch_jacobian(event, torch.from_numpy(states), outputs=1)
-    return values[:, 0].numpy(), gradients[:, 0].numpy()
+    def values(states: Array) -> Array:
+        with torch.no_grad():
+            return np.asarray(event(torch.from_numpy(states))[:, 0].numpy())
+
+    def gradients(states: Array) -> Array:
+        return np.asarray(batch_jacobian(event, torch.from_numpy(states), outputs=1)[1][:, 0].numpy())
+
+    return _Event(values, gradients)
 
 
 def _first(
@@ -221,7 +231,7 @@ def _crossing_step(
     for tau in _crossings(propagator, belief, event, h + JUST_NOW, either_way):  # no gap between steps
         if start + tau > earliest:
             there = propagator.forward(belief, np.array([tau]))
-            return _at_event(there, event(there.mean)[1][0], rolls=_rolls(propagator, there)), there
+            return _at_event(there, event.gradients(there.mean)[0], rolls=_rolls(propagator, there)), there
     return None, propagator.forward(belief, np.array([h]))
 
 
@@ -249,7 +259,7 @@ def _crossings(propagator: Propagator, belief: Belief, event: _Event, h: float, 
     def changes(low: float, high: float) -> Iterator[tuple[float, float, float]]:
         """Brackets of the sign changes between two times, and the value's size at the end of each."""
         times = low + (high - low) * looks
-        values, _ = event(_mean_at(belief, times, propagator.surfaces))
+        values = event.values(_mean_at(belief, times, propagator.surfaces))
         falls = (values[:-1] > 0) & (values[1:] <= 0)
         rises = (values[:-1] < 0) & (values[1:] >= 0)
         for i in np.flatnonzero(falls | rises if either_way else falls).tolist():
