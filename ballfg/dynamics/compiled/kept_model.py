@@ -11,6 +11,7 @@ import hashlib
 import sys
 import weakref
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -104,6 +105,7 @@ class KeptModel:
     Args: facts: as `keep` wrote them.  make: makes the model.
 
     Attributes:
+        radius, inertia_factor, learned_from, noise, spins, domain, variations: as of an `AnalyticModel`.
         names: of the coefficients that travel with the state, as of an `AugmentedModel`.
         alone: the same model without them.
     """
@@ -114,17 +116,15 @@ class KeptModel:
     measures_plainly: ClassVar[bool] = True
 
     def __init__(self, facts: Mapping[str, Any], make: Callable[[], BallModel]) -> None:
-        self._facts, self._make = facts, make
-        self.radius, self.inertia_factor, self.learned_from = facts["radius"], facts["inertia"], facts["learned_from"]
-        for name, read in MAPPINGS.items():
-            setattr(self, name, None if facts[name] is None else read(facts[name]))
-        self.variations = {name: Variation.from_mapping(one) for name, one in facts["variations"].items()}
-        self.names: tuple[str, ...] = ()
+        own = {"radius": facts["radius"], "inertia_factor": facts["inertia"], "learned_from": facts["learned_from"]}
+        own |= {name: None if facts[name] is None else read(facts[name]) for name, read in MAPPINGS.items()}
+        own["variations"] = {name: Variation.from_mapping(one) for name, one in facts["variations"].items()}
+        vars(self).update(own, _facts=facts, _make=make, names=())
         self._has({name: np.float64(value) for name, value in facts["values"].items()})
 
     def _has(self, values: dict[str, np.float64]) -> None:
         """Takes the values of its coefficients."""
-        self._values, self.alone = values, self
+        vars(self).update(_values=values, alone=self)
         NUMBERS[cast("BallModel", self)] = Numbers(
             {name: (values, name) for name in values}, {}, (), [], (self.radius, self.inertia_factor)
         )
@@ -144,6 +144,10 @@ class KeptModel:
         NUMBERS[cast("BallModel", self)] = numbers_of(model)
         return model
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        setattr(self.whole, name, value)  # a change is one of the model
+        vars(self)[name] = value
+
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):  # of protocols of Python, such as that of copies
             raise AttributeError(name)
@@ -162,6 +166,8 @@ class KeptModel:
         return repr(self.whole)
 
     def __reduce__(self) -> tuple[Any, ...]:
+        if "whole" in vars(self.alone):
+            return copy, (self.whole,)
         return _again, (self._facts, self._make, {n: float(v) for n, v in self._values.items()}, self.names)
 
     @cached_property
@@ -211,8 +217,8 @@ class KeptModel:
     def with_travelling(self, names: tuple[str, ...]) -> KeptModel:
         """The model with some coefficients read from the state."""
         other = object.__new__(KeptModel)
-        other.__dict__ |= vars(self) | {"names": names, "alone": self}
-        other.__dict__.pop("whole", None)
+        vars(other).update(vars(self), names=names, alone=self)
+        vars(other).pop("whole", None)
         return other
 
 

@@ -1,5 +1,6 @@
 """A kept model gives the numbers of the model it stands for, without torch, and becomes it for anything else."""
 
+import copy
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -7,12 +8,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from ballfg.dynamics import AnalyticModel, Surfaces, load_model, nominal_model, save_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled import kept_model
 from ballfg.dynamics.compiled.build import read_note
-from ballfg.dynamics.compiled.kept_model import KeptModel, augmented, carried, content_of, keep, ready, ready_file
+from ballfg.dynamics.compiled.kept_model import (
+    KeptModel,
+    augmented,
+    carried,
+    content_of,
+    keep,
+    ready,
+    ready_file,
+    whole,
+)
 from ballfg.dynamics.compiled.motion import Moving, functions_of
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel
@@ -113,14 +124,14 @@ def test_tracks_and_groups_have_their_coefficients(usual: AnalyticModel) -> None
     track = Track(np.arange(5) / 100, np.zeros((5, 3)), labels={"ball": "old"})
     for found in (kept.for_track(track), pickle.loads(pickle.dumps(replaced(kept.for_group("ball", "old"))))):
         assert numbers_of(found).value("flight.drag.k") == 0.15
-        assert found.whole.get_parameter("flight.drag.k").item() == 0.15
+        assert whole(found).get_parameter("flight.drag.k").item() == 0.15
     assert kept.for_track(replace(track, labels={})) is kept
     assert numbers_of(kept).value("flight.drag.k") == numbers_of(usual).value("flight.drag.k")
 
 
 def replaced(kept: KeptModel) -> KeptModel:
     """The same, made by a function that can be pickled."""
-    kept._make = nominal_model  # type: ignore[assignment]
+    vars(kept)["_make"] = nominal_model
     return kept
 
 
@@ -210,3 +221,19 @@ def test_commands_on_a_dataset_need_no_torch(tmp_path: Path) -> None:
         said = fresh(COMMAND.format(words=words), cwd=tmp_path, check=True)
         assert (tmp_path / words[-1]).is_file(), said.stderr
         assert said.stdout.endswith("torch: False\n"), words[0]
+
+
+def test_what_is_changed_is_changed_in_copies_and_in_the_file(tmp_path: Path) -> None:
+    """Attributes, and a coefficient in place: both make the model, which then counts."""
+    kept = made_of(nominal_model(), "a ball that is changed")
+    kept.noise = TrackNoise(position=(0.001, 0.002, 0.003))
+    with torch.no_grad():
+        kept.get_parameter("flight.drag.k").fill_(0.2)
+    again = pickle.loads(pickle.dumps(kept))
+    save_model(kept, tmp_path / "model.yaml")
+    for found in (kept, again, copy.copy(kept), copy.deepcopy(kept), load_model(tmp_path / "model.yaml")):
+        assert found.noise == kept.noise
+        assert float(found.get_parameter("flight.drag.k").detach()) == pytest.approx(0.2)
+    assert content_of(kept) == model_to_dict(again)
+    copy.copy(kept).noise = None
+    assert kept.noise is not None
