@@ -33,23 +33,29 @@ from ballfg.dynamics.compiled.build import machine_code
 ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in (1, 2, 3))
 
 
-@machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
+@machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE), makes_arrays={makes_arrays})
 '''
 """Beginning of each generated file, before `compute`."""
 HELPERS: Final = ("add_product", "tanh_all")  # Functions of `layers.py` that generated ones may call
 
 
-def machine_code(signature: Any, may: Collection[str] = ()) -> Callable[[Callable[..., Any]], Any]:
+def machine_code(
+    signature: Any, may: Collection[str] = (), *, makes_arrays: bool = True
+) -> Callable[[Callable[..., Any]], Any]:
     """Numba's compiler for one signature; kept on disk for other processes.
 
     A function is compiled, or loaded, when it is first called or built into another one: a process pays for what it
     uses.
 
-    Args: may: what LLVM may do to rounding: "contract", a product and a sum rounded once; "reassoc", sums in any order.
+    Args:
+        may: what LLVM may do to rounding: "contract", a product and a sum rounded once; "reassoc", sums in any order.
+        makes_arrays: False for a function that makes none itself. Numba then does not count who holds those that it is
+            given, which takes longer than a short function.
     """
 
     def declared(function: Callable[..., Any]) -> Any:
-        compiler = njit(error_model="numpy", fastmath=set(may))  # numba's own would look for a zero in every division
+        # numba's own error model would look for a zero in every division
+        compiler = njit(error_model="numpy", fastmath=set(may), _nrt=makes_arrays)
         dispatcher: Any = compiler(function)
         dispatcher._cache = Kept(function)
 
@@ -116,7 +122,8 @@ def _text(source: str, calls: Mapping[str, str]) -> str:
         file = Path(__file__).with_name("layers.py")
         imports = f"from ballfg.dynamics.compiled.layers import {', '.join(called)}  # {digest(file)}\n"
     others = (f"from {_name(_text(other, {}))} import compute as {name}\n" for name, other in calls.items())
-    return HEADER.format(imports=imports + "".join(others)) + source
+    makes_arrays = "np.empty" in source
+    return HEADER.format(imports=imports + "".join(others), makes_arrays=makes_arrays) + source
 
 
 def _name(text: str) -> str:

@@ -27,14 +27,14 @@ def white_acceleration(dt, density):
     return density * dt**3 / 3.0, density * dt**2 / 2.0, density * dt
 
 
-@machine_code(NOTHING(ONE, ONE))
+@machine_code(NOTHING(ONE, ONE), makes_arrays=False)
 def put(target, source):
     """Copy numbers (m,); numba's own copy of an array takes a second to compile wherever it is used."""
     for i in range(len(source)):
         target[i] = source[i]
 
 
-@machine_code(NOTHING(TWO, TWO))
+@machine_code(NOTHING(TWO, TWO), makes_arrays=False)
 def put_all(target, source):
     """Copy numbers (m, d)."""
     for i in range(source.shape[0]):
@@ -72,7 +72,7 @@ def still(law):
     return Law(law.compute, law.c, np.empty((law.c.shape[0], law.c.shape[1], 0)), law.w)
 
 
-@machine_code(NOTHING(LAW, ONE, TWO, ONE, TWO))
+@machine_code(NOTHING(LAW, ONE, TWO, ONE, TWO), makes_arrays=False)
 def evaluate(law, x, xt, y, yt):
     """A law of one ball at a state x (9,) with tangents (9, d): writes y (m,) and yt (m, d)."""
     m, d = len(y), xt.shape[1]
@@ -86,7 +86,7 @@ def value_of(law, x, y):
     law.compute(x.reshape(1, 9), law.c, law.w, none, law.ct, y.reshape(1, len(y)), none)
 
 
-@machine_code(NOTHING(LAW, TWO, THREE, TWO, THREE, TWO, THREE))
+@machine_code(NOTHING(LAW, TWO, THREE, TWO, THREE, TWO, THREE), makes_arrays=False)
 def slopes_at(rates, x, xt, k, kt, a, at):
     """The derivatives k (n, 9) of states by time, with tangents; a (n, 6) and at (n, 6, d) are working memory."""
     d = xt.shape[2]
@@ -99,7 +99,7 @@ def slopes_at(rates, x, xt, k, kt, a, at):
                     kt[r, i, q], kt[r, 3 + i, q], kt[r, 6 + i, q] = xt[r, 3 + i, q], at[r, i, q], at[r, 3 + i, q]
 
 
-@machine_code(NOTHING(TWO, THREE, TWO, THREE, REAL, ONE, TWO, TWO, THREE))
+@machine_code(NOTHING(TWO, THREE, TWO, THREE, REAL, ONE, TWO, TWO, THREE), makes_arrays=False)
 def _carry_on(after, aftert, x, xt, share, h, ht, k, kt):
     """Write the states after a share of h (n,) s by slopes k (n, 9), with tangents."""
     n, d = len(x), xt.shape[2]

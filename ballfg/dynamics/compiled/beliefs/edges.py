@@ -31,19 +31,19 @@ def gap_of(surface, x, level, radius):
     return x[2] - level - offset[0] - radius
 
 
-@machine_code(REAL(LAW, ONE, ONE))
+@machine_code(REAL(LAW, ONE, ONE), makes_arrays=False)
 def level_below(surface, x, world):
     """Height (m) of the surface that a ball (9,) falls to; -inf if there is none."""
     return level_at(gap_of(surface, x, 0.0, 0.0), world)
 
 
-@machine_code(REAL(REAL, ONE))
+@machine_code(REAL(REAL, ONE), makes_arrays=False)
 def level_at(z, world):
     """The same for a centre at z (m), less what surfaces lie above their declared heights there."""
     return world[0] if z > world[0] else lower_level(z, world)
 
 
-@machine_code(REAL(REAL, ONE))
+@machine_code(REAL(REAL, ONE), makes_arrays=False)
 def lower_level(z, world):
     """Height (m) of what lies below the table under a centre at z (m); -inf if there is nothing."""
     return world[1] if z > world[1] - DEEPEST else -np.inf
@@ -62,13 +62,13 @@ def height_below(x, raised, world):
     return level_at(z, world) if over_table(x, world) else lower_level(z, world)
 
 
-@machine_code(FLAG(ONE))
+@machine_code(FLAG(ONE), makes_arrays=False)
 def is_slow(x):
     """Whether a state (9,) may be at rest: nearly none is, and their gaps take longer than this look."""
     return abs(x[5]) <= REST_SPEED / 2
 
 
-@machine_code(FLAG(LAW, ONE, REAL, ONE))
+@machine_code(FLAG(LAW, ONE, REAL, ONE), makes_arrays=False)
 def lies_on(surface, x, level, world):
     """Whether a state (9,) lies on the surface at a level (m), which has no ends here."""
     return is_slow(x) and abs(gap_of(surface, x, level, world[2])) <= REST_GAP

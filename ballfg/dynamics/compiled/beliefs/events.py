@@ -102,7 +102,7 @@ def _zero(rates, rolling, resting, x, flown, duration, normal, offset, h, earlie
     return np.nan
 
 
-@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, REAL, ONE, REAL, FLAG, ONE))
+@machine_code(REAL(LAW, LAW, FLAG, ONE, ONE, REAL, REAL, REAL, REAL, ONE, REAL, FLAG, ONE), makes_arrays=False)
 def _first_zero(rates, rolling, resting, x, flown, duration, h, rolls, earliest, normal, offset, either_way, at):
     """`_zero` of a ball that flies for h s, or that rolls and then may fall over an end of the table.
 
@@ -119,7 +119,7 @@ def _first_zero(rates, rolling, resting, x, flown, duration, h, rolls, earliest,
     return event
 
 
-@machine_code(several(REAL, 3)(LAWS, REAL, ONE, ONE, REAL, ONE, ONE))
+@machine_code(several(REAL, 3)(LAWS, REAL, ONE, ONE, REAL, ONE, ONE), makes_arrays=False)
 def _contact_within(laws, low, x, after, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h if it does not, NaN if that is unclear.
 
