@@ -122,7 +122,7 @@ def _text(source: str, calls: Mapping[str, str]) -> str:
         file = Path(__file__).with_name("layers.py")
         imports = f"from ballfg.dynamics.compiled.layers import {', '.join(called)}  # {digest(file)}\n"
     others = (f"from {_name(_text(other, {}))} import compute as {name}\n" for name, other in calls.items())
-    makes_arrays = "np.empty" in source
+    makes_arrays = "np." in source
     return HEADER.format(imports=imports + "".join(others), makes_arrays=makes_arrays) + source
 
 
