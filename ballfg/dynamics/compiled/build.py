@@ -14,6 +14,7 @@ from typing import Any, Final
 from numba import njit
 from numba.core import cgutils
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.options import DefaultOptions
 from numba.extending import intrinsic
 
 from ballfg.dynamics.compiled.arithmetic import lowered
@@ -36,6 +37,8 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 @machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE), makes_arrays={makes_arrays})
 '''
 """Beginning of each generated file, before `compute`."""
+UNCOUNTED: Final[dict[str, Any]] = {"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {}
+"""Numba's option, which its documentation does not name, for code that does not count who holds an array."""
 HELPERS: Final = ("add_product", "tanh_all")  # Functions of `layers.py` that generated ones may call
 
 
@@ -55,7 +58,7 @@ def machine_code(
 
     def declared(function: Callable[..., Any]) -> Any:
         # numba's own error model would look for a zero in every division
-        compiler = njit(error_model="numpy", fastmath=set(may), _nrt=makes_arrays)
+        compiler = njit(error_model="numpy", fastmath=set(may), **({} if makes_arrays else UNCOUNTED))
         dispatcher: Any = compiler(function)
         dispatcher._cache = Kept(function)
 
