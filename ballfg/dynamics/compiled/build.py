@@ -37,8 +37,9 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 @machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE), makes_arrays={makes_arrays})
 '''
 """Beginning of each generated file, before `compute`."""
-UNCOUNTED: Final[dict[str, Any]] = {"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {}
-"""Numba's option, which its documentation does not name, for code that does not count who holds an array."""
+COUNTS: Final = "_nrt"
+"""Numba's option, which its documentation does not name, of code that counts who holds an array. What such code calls
+inherits it where nothing is said."""
 HELPERS: Final = ("add_product", "tanh_all")  # Functions of `layers.py` that generated ones may call
 
 
@@ -58,7 +59,8 @@ def machine_code(
 
     def declared(function: Callable[..., Any]) -> Any:
         # numba's own error model would look for a zero in every division
-        compiler = njit(error_model="numpy", fastmath=set(may), **({} if makes_arrays else UNCOUNTED))
+        counts: dict[str, Any] = {COUNTS: makes_arrays} if hasattr(DefaultOptions, COUNTS) else {}
+        compiler = njit(error_model="numpy", fastmath=set(may), **counts)
         dispatcher: Any = compiler(function)
         dispatcher._cache = Kept(function)
 
