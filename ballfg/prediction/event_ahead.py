@@ -35,12 +35,11 @@ def event_on(path: Path, asked: Plane | str) -> EventAhead:
     if asked == CONTACT:
         return EventAhead(*contact_ahead(path))
     line = Line.of(asked)
-    found, alike = path.mean_event(line)
-    shown = found if found is None or alike else path.of_all(found, line)
+    found, alike = path.event(line)
     torn = line.after > 0 and path.start.other_side is not None  # balls have bounced just now, or have not
     if found is None or not alike or torn:
-        return EventAhead(shown, _chance_of(path, line))
-    return EventAhead(shown, _sooner(found, path.start.time + path.horizon - found.time))
+        return EventAhead(found, _chance_of(path, line))
+    return EventAhead(found, _sooner(found, path.start.time + path.horizon - found.time))
 
 
 def contact_ahead(path: Path) -> tuple[Crossing | None, float]:

@@ -116,21 +116,18 @@ class Path:
 
     def crossing(self, plane: Plane) -> Crossing | None:
         """The crossing of a plane by the mean ball, with the covariance of all balls about it that have one."""
-        return self._event(Line.of(plane))
+        return self.event(Line.of(plane))[0]
 
     def apex(self) -> Crossing | None:
         """The next highest point of the mean ball, with the covariance of all balls about it that have one."""
-        return self._event(Line.of(APEX))
+        return self.event(Line.of(APEX))[0]
 
-    def _event(self, line: Line) -> Crossing | None:
-        found, alike = self.mean_event(line)
-        return found if found is None or alike else self.of_all(found, line)
+    def event(self, line: Line) -> tuple[Crossing | None, bool]:
+        """The mean ball's event with the covariance of all balls about it that have one, and whether all are alike.
 
-    def mean_event(self, line: Line) -> tuple[Crossing | None, bool]:
-        """The mean ball's event, and whether all balls have it as its neighbours do: sooner or later, near its place.
-
-        Near a bounce some have it before and others after; some have had it just now, and have it again later or in
-        the other direction; by an end of the table some meet the table and others do not; some turn before a plane.
+        Alike, all have it as the mean's neighbours do: sooner or later, near its place. Near a bounce some have it
+        before and others after; some have had it just now, and have it again later or in the other direction; by an end
+        of the table some meet the table and others do not; some turn before a plane.
         """
         since = -math.inf
         for _ in range(line.after):
@@ -139,15 +136,15 @@ class Path:
                 return None, False
             since = contact.time
         found = line.find(*self.carried, self.horizon, since)
-        alike = found is not None and not (self._apart(found, line) or self._near_a_bounce(found))
-        return found, alike
-
-    def of_all(self, found: Crossing, line: Line) -> Crossing:
-        """The mean's event with the moments of possible balls that have one; itself if they bounce as often before."""
+        if found is None:
+            return None, False
+        apart = self._apart(found, line)
+        if not (apart or self._near_a_bounce(found)):
+            return found, True
         times, states, met = self._events(line)
-        if len(met) == 0 or not (self._apart(found, line) or (met != met[0]).any()):
-            return found
-        return spread_over(found, states, times - (found.time - self.start.time))
+        if len(met) and (apart or (met != met[0]).any()):
+            found = spread_over(found, states, times - (found.time - self.start.time))
+        return found, False
 
     def _apart(self, found: Crossing, line: Line) -> bool:
         """Whether some balls may have another event than the mean, or none, even if they bounce as often before."""

@@ -27,14 +27,14 @@ def white_acceleration(dt, density):
     return density * dt**3 / 3.0, density * dt**2 / 2.0, density * dt
 
 
-@machine_code(NOTHING(ONE, ONE), makes_arrays=False)
+@machine_code(NOTHING(ONE, ONE))
 def put(target, source):
     """Copy numbers (m,); numba's own copy of an array takes a second to compile wherever it is used."""
     for i in range(len(source)):
         target[i] = source[i]
 
 
-@machine_code(NOTHING(TWO, TWO), makes_arrays=False)
+@machine_code(NOTHING(TWO, TWO))
 def put_all(target, source):
     """Copy numbers (m, d)."""
     for i in range(source.shape[0]):
@@ -99,7 +99,7 @@ def slopes_at(rates, x, xt, k, kt, a, at):
                     kt[r, i, q], kt[r, 3 + i, q], kt[r, 6 + i, q] = xt[r, 3 + i, q], at[r, i, q], at[r, 3 + i, q]
 
 
-@machine_code(NOTHING(TWO, THREE, TWO, THREE, REAL, ONE, TWO, TWO, THREE), makes_arrays=False)
+@machine_code(NOTHING(TWO, THREE, TWO, THREE, REAL, ONE, TWO, TWO, THREE))
 def _carry_on(after, aftert, x, xt, share, h, ht, k, kt):
     """Write the states after a share of h (n,) s by slopes k (n, 9), with tangents."""
     n, d = len(x), xt.shape[2]

@@ -82,16 +82,16 @@ class Moving:
         """(n,) m by which surfaces lie above their declared heights under the balls."""
         return self._value(SURFACE)[0][:, 0]
 
-    def rates(self, part: int = RATES) -> Array:
-        """(n, 6) m/s^2 and rad/s^2 at the start, in flight; on a surface for `ROLLING`."""
-        return self._value(part)[0]
+    def rates(self) -> Array:
+        """(n, 6) m/s^2 and rad/s^2 in flight at the start."""
+        return self._value(RATES)[0]
 
-    def slopes(self, states: Array) -> tuple[Array, Array]:
-        """(n, 9 + p) derivatives by time in flight, and (n, 9 + p, d) by the states.
+    def slopes(self, states: Array, part: int = RATES) -> tuple[Array, Array]:
+        """(n, 9 + p) derivatives by time in flight, or on a surface for `ROLLING`, and (n, 9 + p, d) by the states.
 
         Args: states: (n, 9 + p) other states of the same balls, d = 9 + p, with the coefficients of the start.
         """
-        rates, by_state = self._value(RATES, states)
+        rates, by_state = self._value(part, states)
         slopes, jacobians = np.zeros_like(states), np.zeros((*states.shape, self.width))
         slopes[:, POSITION], slopes[:, VELOCITY.start : STATE_DIM] = states[:, VELOCITY], rates
         jacobians[:, POSITION, VELOCITY], jacobians[:, VELOCITY.start : STATE_DIM] = np.eye(3), by_state

@@ -14,7 +14,7 @@ from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.motion import limits
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.state import VZ, Z
 
 if TYPE_CHECKING:
     from ballfg.dynamics.model import BallModel
@@ -141,11 +141,8 @@ def place_on(model: "BallModel", states: Array, height: Array | float) -> Array:
 
 def motion_rates(model: "BallModel", states: Array, *, rolls: bool) -> Array:
     """(n, 9 + p) derivatives by time of states, in flight, or on a surface."""
-    if (moving := _moving(model, states)) is not None:
-        rates = np.zeros_like(states)
-        rates[:, POSITION] = states[:, VELOCITY]
-        rates[:, VELOCITY.start : STATE_DIM] = moving.rates(motion.ROLLING if rolls else motion.RATES)
-        return rates
+    if (moving := _moving(model, states, states.shape[1])) is not None:
+        return moving.slopes(states, motion.ROLLING if rolls else motion.RATES)[0]
     from ballfg.dynamics.motion.flight_step import derivative
 
     law = model.roll if rolls else model.rates

@@ -37,13 +37,13 @@ def level_below(surface, x, world):
     return level_at(gap_of(surface, x, 0.0, 0.0), world)
 
 
-@machine_code(REAL(REAL, ONE), makes_arrays=False)
+@machine_code(REAL(REAL, ONE))
 def level_at(z, world):
     """The same for a centre at z (m), less what surfaces lie above their declared heights there."""
     return world[0] if z > world[0] else lower_level(z, world)
 
 
-@machine_code(REAL(REAL, ONE), makes_arrays=False)
+@machine_code(REAL(REAL, ONE))
 def lower_level(z, world):
     """Height (m) of what lies below the table under a centre at z (m); -inf if there is nothing."""
     return world[1] if z > world[1] - DEEPEST else -np.inf
@@ -62,7 +62,7 @@ def height_below(x, raised, world):
     return level_at(z, world) if over_table(x, world) else lower_level(z, world)
 
 
-@machine_code(FLAG(ONE), makes_arrays=False)
+@machine_code(FLAG(ONE))
 def is_slow(x):
     """Whether a state (9,) may be at rest: nearly none is, and their gaps take longer than this look."""
     return abs(x[5]) <= REST_SPEED / 2
