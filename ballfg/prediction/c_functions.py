@@ -105,6 +105,7 @@ def cross_plane(
     The covariance is projected onto the plane, as `crossing.plane_crossing` does.
     """
     line, rate, moved = np.zeros(9), np.empty(9), np.empty(9)
+    ends, means, spreads = np.full(1, np.nan), np.empty((1, 9)), np.empty((1, 9, 9))
     length = math.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     sign = -1.0 if direction > 0 else 1.0
     if not (length > 0.0 and math.isfinite(length + offset) and horizon > 0.0 and math.isfinite(horizon)):
@@ -119,6 +120,7 @@ def cross_plane(
         surface.c, surface.ct, rates.w, impact.w, surface.w,
         rolling.compute, rolling.c, rolling.ct, rolling.w,
         False, direction == 0, line, sign * (offset / length), INSTANT, horizon, world, noise, there, spread, rate,
+        ends, means, spreads,
     )  # fmt: skip
     time[0], time_sigma[0] = elapsed, np.inf
     if end != FOUND:

@@ -12,13 +12,13 @@ import numpy as np
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
-from ballfg.dynamics.motion.arrays import is_resting, place_on, surface_offsets
-from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
+from ballfg.dynamics.motion.arrays import bounced, is_resting, place_on, surface_offsets
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_STEP, REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief, normal_points, root_of
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
 from ballfg.prediction.plane import APEX, Plane
-from ballfg.prediction.propagate import Propagator
+from ballfg.prediction.propagate import FlownOnce, Propagator
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
@@ -92,6 +92,12 @@ class Path:
     horizon: float
 
     @cached_property
+    def searched(self) -> tuple[FlownOnce, Belief]:
+        """As `carried`, for several searches of events."""
+        propagator, belief = self.carried
+        return FlownOnce(propagator.surfaces, propagator.noise, belief), belief
+
+    @cached_property
     def possible(self) -> Scattered:
         """Paths of possible balls: at starts that the belief holds, with random accelerations, kicks and ends."""
         (propagator, belief), horizon = self.carried, min(self.horizon, LONGEST_MOTION)
@@ -111,7 +117,7 @@ class Path:
         known = self._contacts
         while not known or (known[-1] is not None and known[-1].time <= after):
             since = known[-1].time if known and known[-1] is not None else -math.inf
-            known.append(next_contact(*self.carried, self.horizon + LATER, after=since))
+            known.append(next_contact(*self.searched, self.horizon + LATER, after=since))
         return next((one for one in known if one is None or one.time > after), None)
 
     def crossing(self, plane: Plane) -> Crossing | None:
@@ -122,10 +128,11 @@ class Path:
         """The next highest point of the mean ball, with the covariance of all balls about it that have one."""
         return self.event(Line.of(APEX))[0]
 
-    def event(self, line: Line) -> tuple[Crossing | None, bool]:
-        """The mean ball's event with the covariance of all balls about it that have one, and whether all are alike.
+    def event(self, line: Line) -> tuple[Crossing | None, Path | None]:
+        """The mean ball's event with the covariance of all balls about it that have one.
 
-        Alike, all have it as the mean's neighbours do: sooner or later, near its place. Near a bounce some have it
+        It also returns the path whose possible balls tell how probable it is; None where all balls are alike: none has
+        it, or all have it as the mean's neighbours do, sooner or later, near its place. Near a bounce some have it
         before and others after; some have had it just now, and have it again later or in the other direction; by an end
         of the table some meet the table and others do not; some turn before a plane.
         """
@@ -133,18 +140,43 @@ class Path:
         for _ in range(line.after):
             contact = self.contact(since)
             if contact is None:
-                return None, False
+                return None, self
             since = contact.time
-        found = line.find(*self.carried, self.horizon, since)
+        found = line.find(*self.searched, self.horizon, since)
         if found is None:
-            return None, False
+            return None, None if self._stays_off(line) else self
         apart = self._apart(found, line)
         if not (apart or self._near_a_bounce(found)):
-            return found, True
-        times, states, met = self._events(line)
+            return found, None
+        soon = math.ceil((found.time - self.start.time + 2.0 * FAR * found.time_sigma) / STEP) * STEP
+        balls = self if apart or soon >= self.horizon else Path(self.start, self.carried, soon)  # all have it by then
+        times, states, met = balls._events(line)
         if len(met) and (apart or (met != met[0]).any()):
             found = spread_over(found, states, times - (found.time - self.start.time))
-        return found, False
+        return found, balls
+
+    def _stays_off(self, line: Line) -> bool:
+        """Whether all balls stay on the mean's side of a plane, which it does not cross within the horizon."""
+        end, contacts, doubt, since = self.start.time + self.horizon, [], 0.0, -math.inf
+        while (contact := self.contact(since)) is not None and contact.time - FAR * contact.time_sigma < end:
+            contacts, since = [*contacts, contact], contact.time
+            doubt += FAR * contact.time_sigma * abs(self._jump(contact) @ line.normal[POSITION])  # bounced, or not yet
+        (propagator, belief), own = self.searched, slice(STATE_DIM)
+        ends, means, spreads = propagator.flown.known()
+        times = np.sort([0.0, *ends, *(contact.time - self.start.time for contact in contacts), self.horizon])
+        if line.is_apex or np.diff(times).max() > 2.0 * MAX_STEP or self._by_an_end(end):
+            return False
+        states = np.stack([belief.mean[0, own], *means[:, own], *(contact.state for contact in contacts)])
+        about = np.stack([belief.covariance[0, own, own], *spreads[:, own, own], *(c.covariance for c in contacts)])
+        values = line.value(states)
+        spread = FAR * np.sqrt(np.maximum(line.normal @ about @ line.normal, 0.0)) + doubt
+        return bool((values > spread).all() or (values < -spread).all())
+
+    def _jump(self, contact: Crossing) -> Array:
+        """(3,) m/s, the change of velocity at the mean's contact."""
+        belief = self.carried[1]
+        before = np.concatenate((contact.state, belief.mean[0, STATE_DIM:]))[None]
+        return np.asarray((bounced(belief.model, before) - before)[0, VELOCITY])
 
     def _apart(self, found: Crossing, line: Line) -> bool:
         """Whether some balls may have another event than the mean, or none, even if they bounce as often before."""
@@ -219,7 +251,7 @@ def may_pass_an_end(path: Path, found: Crossing | None, since: float = -math.inf
         return False
     if found is None or not found.state[Z] > top:  # where the mean falls past the table, if it does
         level = top + belief.model.radius
-        found = plane_crossing(*path.carried, UP, level, path.horizon + LATER, after=since, direction="down")
+        found = plane_crossing(*path.searched, UP, level, path.horizon + LATER, after=since, direction="down")
     if found is None:
         return True
     near = FAR * np.hypot(np.sqrt(np.diagonal(found.covariance)[:2]).repeat(2), surfaces.edge_sigmas)
@@ -244,7 +276,7 @@ def _placed(belief: Belief, errors: Array, surfaces: Surfaces) -> Array:
     return belief.within_bounds(start)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=64)
 def _chance(
     pairs: int, horizon: float, process: ProcessNoise, edge_sigmas: tuple[float, float, float, float]
 ) -> tuple[Array, Array, Array]:

@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, density_of
+from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, Flown, density_of
 from ballfg.dynamics.compiled.beliefs.edges import share_over_table
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.motion import arrays
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from ballfg.dynamics.model import BallModel
 
 AT_ONCE = 128
-"""Largest number of steps of free flight in one call of machine code: more would waste memory on covariances."""
+"""Largest number of steps of free flight in one call of machine code, or kept for searches: more would waste memory."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +133,14 @@ class Propagator:
             belief there, (9 + p,) the event's gradient, and (9 + p,) 1/s, the state's rate of change.
         """
         start = Course.start(belief.mean, belief.covariance)
-        carrier = self._carrier(belief)
-        end, elapsed, course, rate = carrier.find(start, horizon, earliest, line, either_way=either_way)
+        carrier, flown = self._known_from(belief)
+        end, elapsed, course, rate = carrier.find(start, horizon, earliest, line, either_way=either_way, flown=flown)
         (there,) = _beliefs(belief, course, np.array([[elapsed]]))
         return end, there, carrier.gradient(course.mean[-1, 0], line), rate
+
+    def _known_from(self, belief: Belief) -> tuple[Carrier, Flown | None]:
+        """What a search from a belief may use: the laws of its motion, and what has been flown already."""
+        return self._carrier(belief), None
 
     def _carrier(self, belief: Belief) -> Carrier:
         return Carrier(belief.model, belief.mean, self.surfaces, density_of(self.noise))
@@ -223,6 +228,30 @@ class Propagator:
     def _flight_noise(self, dt: float) -> Array:
         """(9, 9) covariance gathered in dt s of free flight."""
         return self.noise.flight(np.array([dt]))[0]
+
+
+@dataclass(frozen=True)
+class FlownOnce(Propagator):
+    """A propagator that flies the way of one ball once, for all searches of events on it.
+
+    Attributes: start: the belief from which that way begins; searches from others fly anew.
+    """
+
+    start: Belief
+
+    @cached_property
+    def flown(self) -> Flown:
+        """The steps of the way that have been flown so far."""
+        return Flown.empty(self.start.mean.shape[1], AT_ONCE)
+
+    @cached_property
+    def _from_start(self) -> Carrier:
+        return self._carrier(self.start)
+
+    def _known_from(self, belief: Belief) -> tuple[Carrier, Flown | None]:
+        if belief.mean is self.start.mean and belief.covariance is self.start.covariance:
+            return self._from_start, self.flown
+        return super()._known_from(belief)
 
 
 def _beliefs(start: Belief, course: Course, elapsed: Array) -> Iterator[Belief]:

@@ -62,6 +62,30 @@ class Course:
         return Course(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Course)))
 
 
+@dataclass(frozen=True)
+class Flown:
+    """The steps of plain flight of one ball from its start on that have been flown so far.
+
+    Attributes:
+        ends: (m,) s since the start; NaN where a step is not known, or not plain flight.
+        means, spreads: (m, 9 + p) and (m, 9 + p, 9 + p), the beliefs then.
+    """
+
+    ends: Array
+    means: Array
+    spreads: Array
+
+    @classmethod
+    def empty(cls, width: int, most: int) -> Self:
+        """Room for some steps of a ball of 9 + p numbers."""
+        return cls(np.full(most, np.nan), np.empty((most, width)), np.empty((most, width, width)))
+
+    def known(self) -> tuple[Array, Array, Array]:
+        """The ends, means and covariances of the known steps."""
+        rows = np.isfinite(self.ends)
+        return self.ends[rows], self.means[rows], self.spreads[rows]
+
+
 class Carrier:
     """Carries the beliefs of n balls on, with the coefficients that they have at the start.
 
@@ -98,7 +122,14 @@ class Carrier:
         return whole.at(slice(done + 1 + bool(hard.any()))), hard
 
     def find(
-        self, course: Course, horizon: float, earliest: float, line: tuple[Array, float] | None, *, either_way: bool
+        self,
+        course: Course,
+        horizon: float,
+        earliest: float,
+        line: tuple[Array, float] | None,
+        *,
+        either_way: bool,
+        flown: Flown | None = None,
     ) -> tuple[float, float, Course, Array]:
         """Look for an event on the way of one ball from the last belief of a course on.
 
@@ -106,14 +137,16 @@ class Carrier:
             horizon, earliest: s from there; only events up to the one and after the other count.
             line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
             either_way: count a rise through the offset as well.
+            flown: what earlier searches from there have flown, which this one adds to.
         Returns: `events.NONE`, `FOUND` or `HARD`; the time (s) from there at which the search ended; the belief then,
             and after `FOUND` the mean's rate of change (9 + p,).
         """
         mean, covariance = course.mean[-1, 0].copy(), course.covariance[-1, 0].copy()
         normal, offset = (np.zeros(STATE_DIM), 0.0) if line is None else line
         how = (line is None, either_way, normal, offset, earliest, horizon)
-        rate = np.zeros(len(mean))
-        end, time = find(*self._laws, *how, self._world, self._noise, mean, covariance, rate[:STATE_DIM])
+        rate, flown = np.zeros(len(mean)), Flown.empty(len(mean), 0) if flown is None else flown
+        known = flown.ends, flown.means, flown.spreads
+        end, time = find(*self._laws, *how, self._world, self._noise, mean, covariance, rate[:STATE_DIM], *known)
         raise_errors()
         return end, time, Course.start(mean[None], covariance[None]), rate
 

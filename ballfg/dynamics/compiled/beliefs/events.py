@@ -16,7 +16,20 @@ from ballfg.dynamics.compiled.beliefs.edges import (
 )
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import fly_one, glide, law_at, laws_of, put, put_all, value_of
-from ballfg.dynamics.compiled.signatures import FLAG, GIVEN, LAW, LAWS, NOTHING, ONE, REAL, ROLLING, TWO, several
+from ballfg.dynamics.compiled.signatures import (
+    COUNT,
+    FLAG,
+    GIVEN,
+    LAW,
+    LAWS,
+    NOTHING,
+    ONE,
+    REAL,
+    ROLLING,
+    THREE,
+    TWO,
+    several,
+)
 from ballfg.dynamics.motion.limits import MAX_STEP
 
 LOOKS = 16  # Number of looks in a step of `MAX_STEP`: two crossings within 1.25 ms may pass unseen
@@ -138,10 +151,48 @@ def _contact_within(laws, low, x, after, h, world, touch):
     return low, tau, np.nan
 
 
-@machine_code(several(REAL, 2)(*GIVEN, *ROLLING, FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO, ONE))
+@machine_code(several(REAL, 4)(LAWS, LAW, ONE, TWO, REAL, ONE, ONE, ONE, TWO, ONE))
+def _go(laws, grounded, mean, covariance, h, world, noise, after, spread, touch):
+    """The level, the two times of `_contact_within` a ball in flight, and NaN; of one at rest how long (s) it rolls.
+
+    Writes: the belief after h s of flight; if the ball is at rest, it is placed on its surface instead.
+    """
+    x = mean[:9]
+    low = level_below(laws.surface, x, world)
+    if stays(laws.rates, laws.surface, x, low, world):
+        x[2] -= gap_of(laws.surface, x, low, world[2])
+        x[5] = 0.0
+        return low, h, np.nan, time_to_end(grounded, x, h, world) if low == world[0] else h
+    fly_belief(laws.rates, mean, covariance, h, noise, after, spread)  # nearly always the whole step
+    low, tau, past = _contact_within(laws, low, x, after[:9], h, world, touch)
+    return low, tau, past, np.nan
+
+
+@machine_code(FLAG(ONE, TWO, THREE, COUNT, REAL, ONE, TWO))
+def _take_step(ends, means, spreads, step, until, after, spread):
+    """Whether the flight up to a time (s) is known as a step of `find`; writes the belief then if it is."""
+    if step >= len(ends) or ends[step] != until:
+        return False
+    put(after, means[step])
+    put_all(spread, spreads[step])
+    return True
+
+
+@machine_code(NOTHING(ONE, TWO, THREE, COUNT, REAL, ONE, TWO))
+def _keep_step(ends, means, spreads, step, until, mean, covariance):
+    """Keeps the belief at the end of a step of `find`, if there is room."""
+    if step < len(ends):
+        ends[step] = until
+        put(means[step], mean)
+        put_all(spreads[step], covariance)
+
+
+@machine_code(
+    several(REAL, 2)(*GIVEN, *ROLLING, FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO, ONE, ONE, TWO, THREE)
+)
 def find(
     rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws, rolling, g, gt, wg,
-    contact, either_way, normal, offset, earliest, horizon, world, noise, mean, covariance, rate,
+    contact, either_way, normal, offset, earliest, horizon, world, noise, mean, covariance, rate, ends, means, spreads,
 ):  # fmt: skip
     """Carries one ball to an event, in place: its next contact, or the time when normal . x falls through an offset.
 
@@ -152,37 +203,34 @@ def find(
         earliest, horizon: s from the start; only events after the one and up to the other count.
         world (11,), noise (5,): as `beliefs.carry`.
     Writes: mean (d,) and covariance (d, d) at the event, or where the search ended; the mean's rate of change there in
-        flight, or at rest, to rate (9,).
+        flight, or at rest, to rate (9,). Of up to m steps of plain flight the end (s) to ends (m,), and the belief to
+        means (m, d) and spreads (m, d, d): a later search from the same start, with the same arrays, takes them.
     Returns: `NONE`, `FOUND` or `HARD`, and the time (s) since the start.
     """
     d, passed, laws = len(mean), 0.0, laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
     after, spread, x, touch = np.empty(d), np.empty((d, d)), mean[:9], np.empty(9)
-    grounded = law_at(rolling, g, gt, wg)
+    grounded, step = law_at(rolling, g, gt, wg), 0
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
-        low, resting, rolls = level_below(laws.surface, x, world), False, h
-        if stays(laws.rates, laws.surface, x, low, world):
-            x[2] -= gap_of(laws.surface, x, low, world[2])
-            x[5] = 0.0
-            tau, past, resting = h, np.nan, True
-            rolls = time_to_end(grounded, x, h, world) if low == world[0] else h
-        else:
-            fly_belief(laws.rates, mean, covariance, h, noise, after, spread)  # nearly always the whole step
-            low, tau, past = _contact_within(laws, low, x, after[:9], h, world, touch)
+        known = _take_step(ends, means, spreads, step, passed + h, after, spread)
+        low, tau, past, rolls = np.nan, h, np.nan, np.nan
+        if not known:
+            low, tau, past, rolls = _go(laws, grounded, mean, covariance, h, world, noise, after, spread, touch)
+        resting = math.isfinite(rolls)
         touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
         flown, event = h, np.nan
         h = INSTANT if touched else tau
         if not touched and not contact:
-            since = earliest - passed
+            still, since = rolls if resting else h, earliest - passed
             event = _first_zero(
-                laws.rates, grounded, resting, x, after[:9], flown, h, rolls, since, normal, offset, either_way, touch
+                laws.rates, grounded, resting, x, after[:9], flown, h, still, since, normal, offset, either_way, touch
             )
         elif not touched and not resting and math.isfinite(low) and passed + h > earliest:
             event = h
+        h = event if math.isfinite(event) else h
         if resting:
-            h = event if math.isfinite(event) else h
             roll_off(laws, grounded, mean, covariance, h, low, world, noise, after, spread)
             resting = h <= rolls
         elif math.isfinite(low) and not math.isfinite(event):
@@ -190,7 +238,6 @@ def find(
                 return HARD, passed
             after[9:] = mean[9:]
         else:
-            h = event if math.isfinite(event) else h
             if h < flown:
                 fly_belief(laws.rates, mean, covariance, h, noise, after, spread)
             beside = contact and low == world[0] and not over_table(after[:9], world)
@@ -199,6 +246,9 @@ def find(
         put(mean, after)
         put_all(covariance, spread)
         passed += h
+        plain = h == MAX_STEP and math.isnan(low) and math.isnan(past) and math.isnan(rolls)
+        _keep_step(ends, means, spreads, step, passed if plain else np.nan, mean, covariance)
+        step += 1
         if math.isfinite(event):
             _rates_at(laws.rates, grounded, resting, x, rate)
             return FOUND, passed
