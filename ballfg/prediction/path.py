@@ -12,7 +12,7 @@ import numpy as np
 from ballfg.arrays import Array, plain
 from ballfg.dynamics.compiled.beliefs.course import Scattered, density_of
 from ballfg.dynamics.compiled.beliefs.mixture import FAR
-from ballfg.dynamics.motion.arrays import bounced, is_resting, place_on, surface_offsets
+from ballfg.dynamics.motion.arrays import is_resting, place_on, surface_offsets
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_STEP, REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief, normal_points, root_of
@@ -157,26 +157,20 @@ class Path:
 
     def _stays_off(self, line: Line) -> bool:
         """Whether all balls stay on the mean's side of a plane, which it does not cross within the horizon."""
-        end, contacts, doubt, since = self.start.time + self.horizon, [], 0.0, -math.inf
-        while (contact := self.contact(since)) is not None and contact.time - FAR * contact.time_sigma < end:
-            contacts, since = [*contacts, contact], contact.time
-            doubt += FAR * contact.time_sigma * abs(self._jump(contact) @ line.normal[POSITION])  # bounced, or not yet
+        if line.is_apex or self._by_an_end(self.start.time + self.horizon):
+            return False
         (propagator, belief), own = self.searched, slice(STATE_DIM)
         ends, means, spreads = propagator.flown.known()
-        times = np.sort([0.0, *ends, *(contact.time - self.start.time for contact in contacts), self.horizon])
-        if line.is_apex or np.diff(times).max() > 2.0 * MAX_STEP or self._by_an_end(end):
+        states = np.concatenate((belief.mean[:, own], means[:, own]))
+        about = np.concatenate((belief.covariance[:, own, own], spreads[:, own, own]))
+        if np.diff(np.abs(ends), prepend=0.0, append=self.horizon).max() > 2.0 * MAX_STEP:
             return False
-        states = np.stack([belief.mean[0, own], *means[:, own], *(contact.state for contact in contacts)])
-        about = np.stack([belief.covariance[0, own, own], *spreads[:, own, own], *(c.covariance for c in contacts)])
+        met = np.flatnonzero(ends < 0.0)  # in these steps some balls have bounced and others not
+        late = np.sqrt(about[met, Z, Z]) / np.maximum(np.abs(states[met, VZ]), np.finfo(float).tiny)
+        doubt = late @ np.abs((states[met + 1] - states[met])[:, VELOCITY] @ line.normal[POSITION])
         values = line.value(states)
-        spread = FAR * np.sqrt(np.maximum(line.normal @ about @ line.normal, 0.0)) + doubt
+        spread = FAR * (np.sqrt(np.maximum(line.normal @ about @ line.normal, 0.0)) + doubt)
         return bool((values > spread).all() or (values < -spread).all())
-
-    def _jump(self, contact: Crossing) -> Array:
-        """(3,) m/s, the change of velocity at the mean's contact."""
-        belief = self.carried[1]
-        before = np.concatenate((contact.state, belief.mean[0, STATE_DIM:]))[None]
-        return np.asarray((bounced(belief.model, before) - before)[0, VELOCITY])
 
     def _apart(self, found: Crossing, line: Line) -> bool:
         """Whether some balls may have another event than the mean, or none, even if they bounce as often before."""
@@ -203,7 +197,7 @@ class Path:
 
     def _by_an_end(self, until: float) -> bool:
         """Whether by a time (s) some balls may meet the table where the mean falls past it, or the reverse."""
-        since = -np.inf
+        since = -np.inf if self.carried[0].surfaces.extent is not None else np.inf
         while since < until:
             contact = self.contact(since)
             if may_pass_an_end(self, contact, since, until):

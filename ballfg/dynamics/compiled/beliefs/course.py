@@ -64,10 +64,10 @@ class Course:
 
 @dataclass(frozen=True)
 class Flown:
-    """The steps of plain flight of one ball from its start on that have been flown so far.
+    """The steps that one ball has flown so far from its start on.
 
     Attributes:
-        ends: (m,) s since the start; NaN where a step is not known, or not plain flight.
+        ends: (m,) s since the start; negative after a step with a contact, or at rest; NaN where none is known.
         means, spreads: (m, 9 + p) and (m, 9 + p, 9 + p), the beliefs then.
     """
 

@@ -178,10 +178,10 @@ def _take_step(ends, means, spreads, step, until, after, spread):
     return True
 
 
-@machine_code(NOTHING(ONE, TWO, THREE, COUNT, REAL, ONE, TWO))
-def _keep_step(ends, means, spreads, step, until, mean, covariance):
-    """Keeps the belief at the end of a step of `find`, if there is room."""
-    if step < len(ends):
+@machine_code(NOTHING(ONE, TWO, THREE, COUNT, FLAG, REAL, ONE, TWO))
+def _keep_step(ends, means, spreads, step, known, until, mean, covariance):
+    """Keeps the belief at the end of a step of `find` unless it is known, if there is room."""
+    if step < len(ends) and not known:
         ends[step] = until
         put(means[step], mean)
         put_all(spreads[step], covariance)
@@ -203,8 +203,9 @@ def find(
         earliest, horizon: s from the start; only events after the one and up to the other count.
         world (11,), noise (5,): as `beliefs.carry`.
     Writes: mean (d,) and covariance (d, d) at the event, or where the search ended; the mean's rate of change there in
-        flight, or at rest, to rate (9,). Of up to m steps of plain flight the end (s) to ends (m,), and the belief to
-        means (m, d) and spreads (m, d, d): a later search from the same start, with the same arrays, takes them.
+        flight, or at rest, to rate (9,). Of up to m steps the end (s) to ends (m,), and the belief then to means (m, d)
+        and spreads (m, d, d): a later search from the same start, with the same arrays, takes the steps of plain
+        flight; the ends of the others are negative.
     Returns: `NONE`, `FOUND` or `HARD`, and the time (s) since the start.
     """
     d, passed, laws = len(mean), 0.0, laws_of(rates, impact, surface, c, ct, b, bt, s, st, w, wb, ws)
@@ -247,7 +248,7 @@ def find(
         put_all(covariance, spread)
         passed += h
         plain = h == MAX_STEP and math.isnan(low) and math.isnan(past) and math.isnan(rolls)
-        _keep_step(ends, means, spreads, step, passed if plain else np.nan, mean, covariance)
+        _keep_step(ends, means, spreads, step, known, passed if plain else -passed, mean, covariance)
         step += 1
         if math.isfinite(event):
             _rates_at(laws.rates, grounded, resting, x, rate)
