@@ -64,7 +64,7 @@ class Bridge:
         self.on_miss = on_miss
         self.calls = 0
         self.misses = 0
-        self._inputs: list[tuple[bytes, ...] | None] = [None] * len(batch)
+        self._inputs: list[tuple[Array, ...] | None] = [None] * len(batch)
         self._answers: list[tuple[Array, tuple[Array, ...]] | None] = [None] * len(batch)
 
     def factor(self, row: int, variables: Sequence[int] | None = None) -> "gtsam.CustomFactor":
@@ -93,7 +93,9 @@ class Bridge:
         Returns: residuals (k, r) and Jacobians (k, r, d), whitened, as cached.
         Raises: ValueError: if the batch returns a wrong shape, another type than float64 or a value that is not finite.
         """
-        inputs = tuple(np.ascontiguousarray(block, dtype=np.float64) for block in inputs)
+        inputs = tuple(
+            np.array(block, dtype=np.float64, order="C") for block in inputs
+        )  # the caller may change its own
         self.calls += 1
         residual, jacobians = checked(self.batch, rows, inputs, *self.batch.compute(rows, inputs))
         for k, row in enumerate(rows.tolist()):
@@ -118,12 +120,11 @@ class Bridge:
 
         Args:
             row: of the batch.
-            inputs: for each variable of the factor its value (d,), in the variable's own units.
+            inputs: for each variable of the factor its value (d,), in the variable's own units; nobody changes it.
             residual: (r,) whitened.
             jacobians: for each variable (r, d) whitened, per unit of the variable.
         """
-        self._inputs[row] = tuple([x.tobytes() for x in inputs])
-        self._answers[row] = residual, jacobians
+        self._inputs[row], self._answers[row] = inputs, (residual, jacobians)
 
     def kept(self, row: int) -> tuple[Array, tuple[Array, ...]]:
         """Residual (r,) and Jacobians (r, d), whitened, of a row that was prepared or cached last."""
@@ -146,7 +147,7 @@ class Bridge:
         """
         vectors = [values.atVector(key) for key in keys]
         asked = tuple([self._seen(key, vector).tobytes() for key, vector in zip(keys, vectors, strict=True)])
-        if asked != self._inputs[row]:
+        if asked != self._seen_last(row):
             self.misses += 1
             self._evaluate(row, keys, values)
         if self._answers[row] is None:
@@ -157,6 +158,11 @@ class Bridge:
         if trial:
             return residual, ()
         return residual, tuple([_widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
+
+    def _seen_last(self, row: int) -> tuple[bytes, ...] | None:
+        """The inputs of a row's cached result, bit by bit."""
+        inputs = self._inputs[row]
+        return None if inputs is None else tuple([x.tobytes() for x in inputs])
 
     def _seen(self, key: int, vector: Array) -> Array:
         """The part of one of GTSAM's vectors that the batch uses."""
@@ -173,7 +179,7 @@ class Bridge:
             if any(p is None for p in held):
                 continue  # a graph of some of the rows only
             point = [self._seen(key_of(v), p) for v, p in zip(variables, held, strict=True) if p is not None]
-            if r == row or tuple(p.tobytes() for p in point) != self._inputs[r]:
+            if r == row or tuple(p.tobytes() for p in point) != self._seen_last(r):
                 rows.append(r)
                 columns.append(point)
         self._try(np.array(rows), tuple(np.stack(column) for column in zip(*columns, strict=True)))

@@ -12,7 +12,7 @@ from ballfg.estimation.online.newest import has_bounced
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.interval import IntervalMaker
-from ballfg.estimation.online.windows.linear import LinearRows
+from ballfg.estimation.online.windows.rows import LinearRows, write_linear
 from ballfg.estimation.online.windows.window_filter import WindowFilter, carried_with_bias
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
@@ -249,7 +249,8 @@ def test_linear_rows_about_other_points_are_those_of_the_factors():
     rows = LinearRows(batches, w, p, columns=28)
     state, after, shared = rng.normal(size=w), rng.normal(size=w), rng.normal(size=p)
     found, begin = np.zeros((rows.dim, 28)), 0
-    rows.write(state, after, shared, found)
+    here = np.zeros(1, dtype=np.int64)
+    write_linear([rows], here, here, np.stack((state, after)), shared, found)
     for batch in batches:
         points = [shared if v == COEFFICIENTS else (state, after)[k] for k, v in enumerate(batch.variables[0].tolist())]
         inputs = tuple(x[None] if batch.sees_biases or len(x) == p else x[None, :9] for x in points)

@@ -7,8 +7,8 @@ without its objects.
 """
 
 import copy
-import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -16,7 +16,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import Measurement, Sample, prepare
 from ballfg.estimation.online.windows.interval import Interval
-from ballfg.estimation.online.windows.linear import LinearFactors, LinearRows, write_factor
+from ballfg.estimation.online.windows.linear import LinearFactors
+from ballfg.estimation.online.windows.rows import Answer, LinearRows, columns_of, write_answers, write_linear
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.correlated_noise import BiasFactors, BiasStartFactors
@@ -26,9 +27,6 @@ from ballfg.factors.linear.elimination import Root, eliminate_on, padded
 from ballfg.factors.linear.substitution import solution_of
 from ballfg.factors.prior import coefficient_prior
 
-Answer = tuple[Array, tuple[Array, ...]]
-"""Residuals and Jacobians, whitened."""
-
 
 class ChainWindow(StreamWindow):
     """The window as a chain: arguments and attributes as those of `StreamWindow`."""
@@ -37,12 +35,13 @@ class ChainWindow(StreamWindow):
         """Removes all states; the information from earlier states on the first one stays."""
         super()._clear()
         self._columns = padded(2 * self.width + self.p + 1)
+        self._across = (0, self.width, 2 * self.width)[: 3 if self.p else 2]  # columns of an interval's variables
         self._priors: list[list[FactorBatch]] = []  # of each state, and of its tracker's bias
         self._linear: list[LinearRows | None] = []  # of each state; None where they are to be made
         self._links: list[LinearRows] = []  # of each interval, between the tracker's biases, if there are any
         self._rows: list[Array] = []  # of each state: (r, columns) of all factors of which it is the first state
         self._room(0)
-        self._answers: list[list[tuple[FactorBatch, Answer]]] = []  # of each: measurements and the interval after it
+        self._answers: list[list[Answer]] = []  # of each: measurements and the interval after it
         self._stale: dict[int, bool] = {}  # states whose rows are to be written, and whether their answers are new
         if not self.first:
             self._summary: LinearFactors | None = None  # of the first state and the coefficients
@@ -96,7 +95,7 @@ class ChainWindow(StreamWindow):
             del held[count:]
         del self.intervals[count - 1 :], self._links[count - 1 :]
         self.theta, self._stale = self.theta[:count], {k: new for k, new in self._stale.items() if k < count}
-        self._answers[-1] = [answer for answer in self._answers[-1] if not isinstance(answer[0], DynamicsFactors)]
+        self._answers[-1] = [answer for answer in self._answers[-1] if not isinstance(answer.batch, DynamicsFactors)]
         self._renew([count - 1], moved=False)
 
     def append_all(self, samples: Sequence[Sample]) -> Array:
@@ -145,7 +144,8 @@ class ChainWindow(StreamWindow):
         carries, shared, root = (held[leaving:] for held in self._chain)  # what stays is eliminated already
         carries[0], shared[0] = 0.0, 0.0  # the summary holds it
         self._chain = carries, shared, root
-        self._rows[0] = self._rows_of(0, moved=False)
+        self._renew([0], moved=False)
+        self._write()
 
     def summaries(self) -> list[FactorBatch]:
         """The information of removed states, as one linear factor."""
@@ -176,30 +176,39 @@ class ChainWindow(StreamWindow):
             if moved and k:
                 self._stale[k - 1] = True
 
-    def _rows_of(self, k: int, moved: bool) -> Array:
-        """(r, columns) of all factors whose first state is k; `moved` if some have been evaluated anew."""
-        sample, interval = self.samples[k], self.intervals[k] if k < len(self.intervals) else None
-        if moved:  # bridges are shared with copies of the window, results are not
-            asked = [(m.batch, m.bridge) for m in sample.measurements]
-            asked += [] if interval is None else [(interval.batch, interval.bridge)]
-            kept = [(batch, *bridge.kept(0)) for batch, bridge in asked]
-            self._answers[k] = [(batch, (r[None], tuple([b[None] for b in blocks]))) for batch, r, blocks in kept]
-        own = self._linear[k] = self._linear[k] or self._linear_rows(k)
-        linear = [own, *self._links[k : k + 1]]
-        count = sum(part.dim for part in linear) + sum(batch.dim for batch, _ in self._answers[k])
-        written, row = np.zeros((count, self._columns)), 0
-        for part in linear:
-            after = self.theta[min(k + 1, len(self.theta) - 1)]
-            part.write(self.theta[k], after, self.coefficient_theta, written[row : row + part.dim])
-            row += part.dim
-        for batch, (residual, blocks) in self._answers[k]:
-            rows = written[row : row + batch.dim]
-            write_factor(batch, blocks, self.width, rows)
-            rows[:, -1] = -residual[0]
-            if batch.loss.name != "squared":  # as in GTSAM's noise models
-                rows *= math.sqrt(float(batch.loss.weight(np.sqrt(residual[0] @ residual[0]))))
-            row += batch.dim
-        return written
+    def _write(self) -> None:
+        """Writes the rows of all stale states: those of the factors whose first state each is."""
+        parts, numbers, begins = list[LinearRows](), list[int](), list[int]()
+        answers, firsts, edges = list[Answer](), list[int](), [0]
+        for k, moved in self._stale.items():
+            self._answers[k] = self._ask(k) if moved else self._answers[k]
+            own = self._linear[k] = self._linear[k] or self._linear_rows(k)
+            row = edges[-1]
+            for part in (own, *self._links[k : k + 1]):
+                parts.append(part)
+                numbers.append(k)
+                begins.append(row)
+                row += part.dim
+            for answer in self._answers[k]:
+                answers.append(answer)
+                firsts.append(row)
+                row += len(answer.residual)
+            edges.append(row)
+        written = np.zeros((edges[-1], self._columns))
+        write_linear(parts, np.array(numbers), np.array(begins), self.theta, self.coefficient_theta, written)
+        write_answers(answers, firsts, written)
+        for k, (begin, end) in zip(self._stale, pairwise(edges), strict=True):
+            self._rows[k] = written[begin:end]
+        self._stale.clear()
+
+    def _ask(self, k: int) -> list[Answer]:
+        """The newest answers of a state's measurements and of the interval after it."""
+        found = [
+            Answer(m.batch, *m.bridge.kept(0), columns_of(m.batch, self.width)) for m in self.samples[k].measurements
+        ]
+        if k < len(self.intervals) and (interval := self.intervals[k]) is not None:
+            found.append(Answer(interval.batch, *interval.bridge.kept(0), self._across))
+        return found  # bridges are shared with copies of the window, results are not
 
     def _linear_rows(self, k: int) -> LinearRows:
         """The rows of a state's own linear factors: its position's and its priors, those of the first one's past."""
@@ -221,9 +230,7 @@ class ChainWindow(StreamWindow):
         begin = min(self._stale, default=n - 1)
         if n > len(self._chain[2]):
             self._room(n)
-        for k, moved in self._stale.items():
-            self._rows[k] = self._rows_of(k, moved)
-        self._stale.clear()
+        self._write()
         rows = self._rows[begin:]
         start = np.zeros(len(rows) + 1, dtype=np.int64)
         np.cumsum([len(part) for part in rows], out=start[1:])

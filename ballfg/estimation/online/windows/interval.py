@@ -125,5 +125,7 @@ def store(intervals: Sequence[Interval], start: Array, after: Array, coefficient
         blocks = (*blocks, by_start[..., STATE_DIM:])
     if not (np.isfinite(residual).all() and np.isfinite(by_start).all()):
         checked(intervals[0].batch, slice(None), inputs, residual, blocks)  # says what is not finite
-    for row, interval in enumerate(intervals):
-        interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))
+    for interval, own, errors, jacobians in zip(
+        intervals, zip(*inputs, strict=True), residual, zip(*blocks, strict=True), strict=True
+    ):
+        interval.bridge.keep(0, own, errors, jacobians)
