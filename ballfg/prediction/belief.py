@@ -128,11 +128,13 @@ def _bounds(model: BallModel, names: tuple[str, ...]) -> tuple[Array, Array]:
 
 def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_sigma: Array) -> tuple[Array, Array]:
     """Mean (9 + p,) and covariance (9 + p, 9 + p) of a state and of all coefficients."""
-    mean = np.concatenate((state.state, prior_mean))
-    covariance = np.diag(np.concatenate((np.zeros(STATE_DIM), prior_sigma**2)))
-    own = np.array([*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in state.coefficient_names)])
-    mean[own] = state.mean
-    covariance[np.ix_(own, own)] = state.joint
+    mean, covariance = state.mean.copy(), state.joint.copy()
+    if state.coefficient_names != names:
+        mean = np.concatenate((state.state, prior_mean))
+        covariance = np.diag(np.concatenate((np.zeros(STATE_DIM), prior_sigma**2)))
+        own = np.array([*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in state.coefficient_names)])
+        mean[own] = state.mean
+        covariance[np.ix_(own, own)] = state.joint
     if state.other_side is not None:
         covariance[:STATE_DIM, :STATE_DIM] -= state.other_side
     return mean, (covariance + covariance.T) / 2

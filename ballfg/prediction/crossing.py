@@ -17,12 +17,13 @@ from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_number
+from ballfg.dynamics.compiled.beliefs.course import Found
 from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
 from ballfg.dynamics.motion import arrays
 from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
-from ballfg.prediction.plane import Plane
+from ballfg.prediction.plane import APEX, Line, Plane
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VZ
 
@@ -36,7 +37,7 @@ EventFunction = Callable[["Tensor"], "Tensor"]
 SearchStep = Callable[[Belief, float, float], tuple["Crossing | None", Belief]]
 """From a belief, the end of a search and the time (s) from which events count to an event and the belief then."""
 
-Search = Callable[..., tuple[float, Belief, Array, Array]]
+Search = Callable[..., Found]
 """As `Propagator.search`, of a belief, a horizon and the time from which events count."""
 VALUE_JUMP = 1e-6  # Largest value, in the event's own unit, of a crossing; a larger one jumped through zero in a bounce
 JUST_NOW = 1e-9  # s. Least delay of a new event after the time from which events count
@@ -83,9 +84,7 @@ def apex(propagator: Propagator, belief: Belief, horizon: float = 3.0, *, after:
     Returns: None if there is none within the horizon. A resting ball has none.
     Raises: ValueError: as `next_crossing`.
     """
-    normal = np.zeros(STATE_DIM)
-    normal[VZ] = 1.0
-    return _line_crossing(propagator, belief, (normal, 0.0), horizon, after)
+    return line_crossing(propagator, belief, Line.of(APEX), horizon, after)
 
 
 def next_contact(
@@ -121,29 +120,20 @@ def plane_crossing(
     Raises: ValueError: a normal that is zero or not three finite numbers, an unknown direction, or as `next_crossing`.
     """
     given = tuple(check_array("normal", normal).ravel().tolist())
-    towards, place = Plane(given, offset, direction).line  # type: ignore[arg-type]
-    line, sign = np.zeros(STATE_DIM), -1.0 if direction == "up" else 1.0
-    line[POSITION] = sign * towards
-    return _line_crossing(propagator, belief, (line, sign * place), horizon, after, either_way=direction == "either")
+    return line_crossing(propagator, belief, Line.of(Plane(given, offset, direction)), horizon, after)  # type: ignore[arg-type]
 
 
-def _line_crossing(
-    propagator: Propagator,
-    belief: Belief,
-    line: tuple[Array, float],
-    horizon: float,
-    after: float,
-    *,
-    either_way: bool = False,
-) -> Crossing | None:
-    """The next time at which normal . state (9,) falls through an offset; line: both."""
-    gradient, offset = np.zeros(belief.mean.shape[1]), line[1]
-    gradient[:STATE_DIM] = line[0]
+def line_crossing(propagator: Propagator, belief: Belief, line: Line, horizon: float, after: float) -> Crossing | None:
+    """The next time at which a ball goes through a line's offset; args as for `next_crossing`."""
+    normal, offset = line.falling
 
-    event = _Event(lambda states: states @ gradient - offset, lambda states: np.tile(gradient, (len(states), 1)))
+    def step(belief: Belief, end: float, earliest: float) -> tuple[Crossing | None, Belief]:
+        gradient = np.concatenate((normal, np.zeros(belief.mean.shape[1] - STATE_DIM)))
+        event = _Event(lambda s: s @ gradient - offset, lambda s: np.tile(gradient, (len(s), 1)))
+        return _crossing_step(propagator, event, line.either_way, belief, end, earliest)
 
-    step = partial(_crossing_step, propagator, event, either_way)
-    return _first(belief, horizon, after, step, partial(propagator.search, line=line, either_way=either_way))
+    search = partial(propagator.search, line=(normal, offset), either_way=line.either_way)
+    return _first(belief, horizon, after, step, search)
 
 
 def next_crossing(
@@ -193,17 +183,24 @@ def _first(
         raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
     end, start = check_number("horizon", horizon, "s", above=0.0), float(belief.time[0])
     earliest = max(after - start, 0.0) + JUST_NOW + float(np.spacing(abs(start)))  # as `after` was rounded
-    belief = belief.from_zero()
-    while (left := end - float(belief.time[0])) > 0.0:
+    now = 0.0
+    while now < end:
         if search is not None:
-            how, belief, gradient, rate = search(belief, left, earliest - float(belief.time[0]))
-            if how == FOUND:
-                return _projected(belief, gradient, rate).later(start)
-            if how == NONE:
+            found = search(belief, end - now, earliest - now)
+            if found.how == FOUND:
+                return _projected(
+                    start + (now + found.elapsed), found.mean, found.covariance, found.gradient, found.rate
+                )
+            if found.how == NONE:
                 return None
+            now += found.elapsed
+            belief = Belief(belief.model, np.array([now]), found.mean[None], found.covariance[None])
+        elif now == 0.0:
+            belief = belief.from_zero()
         crossing, belief = step(belief, end, earliest)
         if crossing is not None:
             return crossing.later(start)
+        now = float(belief.time[0])
     return None
 
 
@@ -287,18 +284,19 @@ def _rolls(propagator: Propagator, belief: Belief) -> bool:
 
 
 def _at_event(there: Belief, gradient: Array, *, rolls: bool) -> Crossing:
-    return _projected(there, gradient, arrays.motion_rates(there.model, there.mean, rolls=rolls)[0])
+    rate = arrays.motion_rates(there.model, there.mean, rolls=rolls)[0]
+    return _projected(float(there.time[0]), there.mean[0], there.covariance[0], gradient, rate)
 
 
-def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
+def _projected(time: float, mean: Array, covariance: Array, gradient: Array, rate: Array) -> Crossing:
     """The crossing of a belief, with the covariance projected along the motion onto the event's surface.
 
     If the motion only touches the surface, the time is undetermined: its sigma is infinite, and the covariance is that
     at the mean time.
 
-    Args: gradient: (d,) of the event.  rate: (d,) of the state.
+    Args: time: s.  mean (d,), covariance (d, d): then.  gradient: (d,) of the event.  rate: (d,) of the state.
     """
-    covariance, closing, time_sigma = there.covariance[0], gradient @ rate, math.inf
+    closing, time_sigma = gradient @ rate, math.inf
     spread = covariance[:STATE_DIM, :STATE_DIM].copy()
     if closing != 0.0:
         time_by_state = -gradient / closing
@@ -306,4 +304,4 @@ def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
         time_sigma = math.sqrt(max(float(time_by_state @ covariance @ time_by_state), 0.0))
         spread = projection @ covariance @ projection.T
         spread = (spread + spread.T) / 2
-    return Crossing(float(there.time[0]), time_sigma, there.mean[0, :STATE_DIM].copy(), spread)
+    return Crossing(time, time_sigma, mean[:STATE_DIM].copy(), spread)

@@ -15,8 +15,8 @@ import numpy as np
 
 from ballfg.dynamics.motion.arrays import bounced
 from ballfg.prediction.crossing import Crossing
-from ballfg.prediction.path import LATER, Line, Path, may_pass_an_end, spread_over
-from ballfg.prediction.plane import AXES, CONTACT, Plane
+from ballfg.prediction.path import LATER, Path, may_pass_an_end, spread_over
+from ballfg.prediction.plane import AXES, CONTACT, Line, Plane
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
 MOST: Final = 0.5  # Largest share of balls on the less probable side of a bounce

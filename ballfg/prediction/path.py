@@ -16,8 +16,8 @@ from ballfg.dynamics.motion.arrays import is_resting, place_on, surface_offsets
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_STEP, REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief, normal_points, root_of
-from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
-from ballfg.prediction.plane import APEX, Plane
+from ballfg.prediction.crossing import Crossing, line_crossing, next_contact
+from ballfg.prediction.plane import APEX, Line, Plane
 from ballfg.prediction.propagate import FlownOnce, Propagator
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ, Z
 
@@ -32,55 +32,7 @@ SPANS: Final = 8
 10 s ahead it lasts at most a step longer than the time before it, else balls lie too close together in it."""
 LATER: Final = 1.0
 """s beyond the horizon in which a contact is looked for, which other balls than the mean one may have within it."""
-TOP: Final = np.eye(STATE_DIM)[VZ]  # An apex is a fall of this line (9,) . state through zero
-UP: Final = np.eye(3)[2]  # Normal of the table's plane
 Carried: TypeAlias = tuple[Propagator, Belief]
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """An event at which a line of the state goes through an offset: an apex, or the crossing of a plane.
-
-    Attributes:
-        normal: (9,), offset: the ball has the event where normal . state is the offset.
-        direction: `up`, `down` or `either`.  after: number of bounces before it.
-    """
-
-    normal: Array
-    offset: float
-    direction: str
-    after: int
-
-    @classmethod
-    def of(cls, asked: Plane | str) -> Line:
-        """The line of a plane; of `apex` for any text."""
-        if not isinstance(asked, Plane):
-            return cls(TOP, 0.0, "down", 0)
-        normal, (towards, place) = np.zeros(STATE_DIM), asked.line
-        normal[POSITION] = towards
-        return cls(normal, place, asked.direction, asked.after)
-
-    @property
-    def is_apex(self) -> bool:
-        """True for an apex."""
-        return bool(self.normal[VZ])
-
-    def value(self, states: Array) -> Array:
-        """(...) line . state beyond the offset, of states (..., 9)."""
-        return np.asarray(states @ self.normal - self.offset)
-
-    def find(self, propagator: Propagator, belief: Belief, horizon: float, since: float) -> Crossing | None:
-        """The mean ball's first event after a time, s."""
-        if self.is_apex:
-            return apex(propagator, belief, horizon, after=since)
-        line = self.normal[POSITION], self.offset
-        return plane_crossing(propagator, belief, *line, horizon, after=since, direction=self.direction)
-
-    def may_turn(self, found: Crossing) -> bool:
-        """Whether some balls may not be fast enough to cross where the mean does; all balls fall at an apex."""
-        normal = self.normal[POSITION]
-        variance = float(normal @ found.covariance[VELOCITY, VELOCITY] @ normal)
-        return abs(float(normal @ found.state[VELOCITY])) <= FAR * math.sqrt(max(variance, 0.0)) and not self.is_apex
 
 
 @dataclass(frozen=True)
@@ -142,7 +94,7 @@ class Path:
             if contact is None:
                 return None, self
             since = contact.time
-        found = line.find(*self.searched, self.horizon, since)
+        found = line_crossing(*self.searched, line, self.horizon, since)
         if found is None:
             return None, None if self._stays_off(line) else self
         apart = self._apart(found, line)
@@ -175,7 +127,7 @@ class Path:
     def _apart(self, found: Crossing, line: Line) -> bool:
         """Whether some balls may have another event than the mean, or none, even if they bounce as often before."""
         until = found.time + FAR * found.time_sigma
-        return self._just_now(line) or line.may_turn(found) or self._by_an_end(until)
+        return self._just_now(line) or may_turn(line, found) or self._by_an_end(until)
 
     def _just_now(self, line: Line) -> bool:
         """Whether some balls may be on the other side of an event than the mean at the start."""
@@ -234,6 +186,13 @@ class Path:
         return float((np.maximum.accumulate(first, axis=1) & then).any(axis=1).mean())
 
 
+def may_turn(line: Line, found: Crossing) -> bool:
+    """Whether some balls may not be fast enough to cross where the mean does; all balls fall at an apex."""
+    normal = line.normal[POSITION]
+    variance = float(normal @ found.covariance[VELOCITY, VELOCITY] @ normal)
+    return abs(float(normal @ found.state[VELOCITY])) <= FAR * math.sqrt(max(variance, 0.0)) and not line.is_apex
+
+
 def may_pass_an_end(path: Path, found: Crossing | None, since: float = -math.inf, until: float = math.inf) -> bool:
     """Whether some balls may come down on the table and others past its ends, before a time (s).
 
@@ -245,7 +204,8 @@ def may_pass_an_end(path: Path, found: Crossing | None, since: float = -math.inf
         return False
     if found is None or not found.state[Z] > top:  # where the mean falls past the table, if it does
         level = top + belief.model.radius
-        found = plane_crossing(*path.searched, UP, level, path.horizon + LATER, after=since, direction="down")
+        lid = Line.of(Plane((0.0, 0.0, 1.0), level, "down"))
+        found = line_crossing(*path.searched, lid, path.horizon + LATER, since)
     if found is None:
         return True
     near = FAR * np.hypot(np.sqrt(np.diagonal(found.covariance)[:2]).repeat(2), surfaces.edge_sigmas)

@@ -1,5 +1,7 @@
 """Describes a plane that a ball may cross: where it is, in which direction, and after how many bounces."""
 
+from __future__ import annotations
+
 import math
 import re
 from dataclasses import dataclass
@@ -9,11 +11,13 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import check_array, check_choice, check_count, check_number, shown
+from ballfg.state import POSITION, STATE_DIM, VZ
 
 AXES: Final = ("x", "y", "z")
 APEX, CONTACT = "apex", "next-contact"
 DIRECTIONS: Final = ("either", "up", "down")
 MOST_BOUNCES: Final = 20  # Largest number of bounces before a crossing: after so many a ball rolls
+TOP: Final = np.eye(STATE_DIM)[VZ]  # An apex is a fall of this line (9,) . state through zero
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,49 @@ class Plane:
         normal = np.array(self.normal)
         length = float(np.linalg.norm(normal))
         return normal / length, self.offset / length
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """An event at which a line of the state goes through an offset: an apex, or the crossing of a plane.
+
+    Attributes:
+        normal: (9,), offset: the ball has the event where normal . state is the offset.
+        direction: `up`, `down` or `either`.  after: number of bounces before it.
+    """
+
+    normal: Array
+    offset: float
+    direction: str
+    after: int
+
+    @classmethod
+    def of(cls, asked: Plane | str) -> Line:
+        """The line of a plane; of `apex` for any text."""
+        if not isinstance(asked, Plane):
+            return cls(TOP, 0.0, "down", 0)
+        normal, (towards, place) = np.zeros(STATE_DIM), asked.line
+        normal[POSITION] = towards
+        return cls(normal, place, asked.direction, asked.after)
+
+    @property
+    def is_apex(self) -> bool:
+        """True for an apex."""
+        return bool(self.normal[VZ])
+
+    def value(self, states: Array) -> Array:
+        """(...) line . state beyond the offset, of states (..., 9)."""
+        return np.asarray(states @ self.normal - self.offset)
+
+    @property
+    def falling(self) -> tuple[Array, float]:
+        """The normal and the offset, both turned where only a rise counts: a ball with the event falls through them."""
+        return (-self.normal, -self.offset) if self.direction == "up" else (self.normal, self.offset)
+
+    @property
+    def either_way(self) -> bool:
+        """True if a fall and a rise count."""
+        return self.direction == "either"
 
 
 def _normal(text: str) -> tuple[float, float, float] | None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, Flown, density_of
+from ballfg.dynamics.compiled.beliefs.course import Carrier, Course, Flown, Found, density_of
 from ballfg.dynamics.compiled.beliefs.edges import share_over_table
 from ballfg.dynamics.compiled.motion import world_of
 from ballfg.dynamics.motion import arrays
@@ -120,7 +120,7 @@ class Propagator:
         line: tuple[Array, float] | None = None,
         *,
         either_way: bool = False,
-    ) -> tuple[float, Belief, Array, Array]:
+    ) -> Found:
         """Searches for an event on the way of one ball, through flight and plain bounces.
 
         Args:
@@ -128,15 +128,9 @@ class Propagator:
             horizon, earliest: s from the belief's time; only events up to the one and after the other count.
             line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
             either_way: count a rise through the offset as well.
-
-        Returns: `events.NONE`, `FOUND`, or `HARD` before a landing, several bounces, or a bounce at a table's edge; the
-            belief there, (9 + p,) the event's gradient, and (9 + p,) 1/s, the state's rate of change.
         """
-        start = Course.start(belief.mean, belief.covariance)
         carrier, flown = self._known_from(belief)
-        end, elapsed, course, rate = carrier.find(start, horizon, earliest, line, either_way=either_way, flown=flown)
-        (there,) = _beliefs(belief, course, np.array([[elapsed]]))
-        return end, there, carrier.gradient(course.mean[-1, 0], line), rate
+        return carrier.find(belief.mean[0], belief.covariance[0], horizon, earliest, line, either_way, flown)
 
     def _known_from(self, belief: Belief) -> tuple[Carrier, Flown | None]:
         """What a search from a belief may use: the laws of its motion, and what has been flown already."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
 
@@ -86,6 +86,23 @@ class Flown:
         return self.ends[rows], self.means[rows], self.spreads[rows]
 
 
+class Found(NamedTuple):
+    """The end of a search for an event.
+
+    Attributes:
+        how: `events.NONE`, `FOUND`, or `HARD` before a landing, several bounces, or a bounce at a table's edge.
+        elapsed: s since the start.  mean, covariance: (9 + p,) and (9 + p, 9 + p) then.
+        gradient: (9 + p,) the event's.  rate: (9 + p,) 1/s, the mean's rate of change, of an event that was found.
+    """
+
+    how: float
+    elapsed: float
+    mean: Array
+    covariance: Array
+    gradient: Array
+    rate: Array
+
+
 class Carrier:
     """Carries the beliefs of n balls on, with the coefficients that they have at the start.
 
@@ -123,34 +140,33 @@ class Carrier:
 
     def find(
         self,
-        course: Course,
+        mean: Array,
+        covariance: Array,
         horizon: float,
         earliest: float,
         line: tuple[Array, float] | None,
-        *,
         either_way: bool,
         flown: Flown | None = None,
-    ) -> tuple[float, float, Course, Array]:
-        """Look for an event on the way of one ball from the last belief of a course on.
+    ) -> Found:
+        """Look for an event on the way of one ball.
 
         Args:
+            mean, covariance: (9 + p,) and (9 + p, 9 + p), at the start.
             horizon, earliest: s from there; only events up to the one and after the other count.
             line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
             either_way: count a rise through the offset as well.
             flown: what earlier searches from there have flown, which this one adds to.
-        Returns: `events.NONE`, `FOUND` or `HARD`; the time (s) from there at which the search ended; the belief then,
-            and after `FOUND` the mean's rate of change (9 + p,).
         """
-        mean, covariance = course.mean[-1, 0].copy(), course.covariance[-1, 0].copy()
+        mean, covariance, rate = mean.copy(), covariance.copy(), np.zeros(len(mean))
         normal, offset = (np.zeros(STATE_DIM), 0.0) if line is None else line
         how = (line is None, either_way, normal, offset, earliest, horizon)
-        rate, flown = np.zeros(len(mean)), Flown.empty(len(mean), 0) if flown is None else flown
+        flown = Flown.empty(len(mean), 0) if flown is None else flown
         known = flown.ends, flown.means, flown.spreads
         end, time = find(*self._laws, *how, self._world, self._noise, mean, covariance, rate[:STATE_DIM], *known)
         raise_errors()
-        return end, time, Course.start(mean[None], covariance[None]), rate
+        return Found(end, time, mean, covariance, self._gradient(mean, line), rate)
 
-    def gradient(self, mean: Array, line: tuple[Array, float] | None) -> Array:
+    def _gradient(self, mean: Array, line: tuple[Array, float] | None) -> Array:
         """Gradient (9 + p,) of the event of `find` at a mean (9 + p,)."""
         width, x = len(mean), mean[None, :STATE_DIM].copy()
         gradient, moved = np.zeros(width), np.zeros((1, 3, width))
