@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import NOTHING, ONE, TWO
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings
 from ballfg.factors.linear.definite import compatible, definite, variances_positive
@@ -64,10 +66,21 @@ def possible(states: Array) -> NDArray[np.bool_]:
     A track lies within `MAX_COORDINATE` m; no ball is faster than `FASTEST_BALL` m/s or spins faster than
     `FASTEST_SPIN` rad/s.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        speed, spin = (np.linalg.norm(states[..., part], axis=-1) for part in (VELOCITY, SPIN))
-        near = np.abs(states[..., POSITION]).max(axis=-1) <= 2.0 * MAX_COORDINATE
-        return np.asarray(near & (speed <= FASTEST_BALL) & (spin <= FASTEST_SPIN))
+    own, fits = np.ascontiguousarray(states.reshape(-1, STATE_DIM), dtype=np.float64), np.empty(states.shape[:-1])
+    _fits(own, fits.reshape(-1))
+    return np.asarray(fits > 0.0)
+
+
+@machine_code(NOTHING(TWO, ONE), makes_arrays=False)
+def _fits(states: Array, fits: Array) -> None:
+    """Writes 1 for each state (n, 9) that is possible, else 0; comparisons with what is not a number are false."""
+    for k in range(len(states)):
+        near, speed, spin = True, 0.0, 0.0
+        for i in range(3):
+            near = near and abs(states[k, i]) <= 2.0 * MAX_COORDINATE
+            speed += states[k, 3 + i] ** 2
+            spin += states[k, 6 + i] ** 2
+        fits[k] = 1.0 if near and speed <= FASTEST_BALL**2 and spin <= FASTEST_SPIN**2 else 0.0
 
 
 def measured_only(positions: Array, sigma: Array, settings: Settings) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from ballfg.estimation.plausible import possible
 from ballfg.estimation.result import Status
 from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
 from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
-from ballfg.estimation.sides.struck import HitDoubt, RestDoubt, beside
+from ballfg.estimation.sides.struck import AGREES, HitDoubt, RestDoubt, beside
 from ballfg.estimation.smoother.motion import FLIGHT
 from ballfg.estimation.smoother.problem import coefficient_means
 from ballfg.factors.linear.definite import definite, variances_positive
@@ -23,6 +23,10 @@ from ballfg.state import STATE_DIM
 
 if TYPE_CHECKING:
     from ballfg.estimation.online.online import Online
+
+SURELY = 0.5 * AGREES
+"""Squared innovation of the window below which a sample agrees with its flight: another prediction need not tell. Both
+are alike to 1e-5 where no state moved, and never differ by half."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,9 @@ class Newest:
         """The state, its covariance widened where its sample may have followed a hit that nothing tells yet."""
         sample = samples[-1]
         if before is None or not sample.measured or sample.motion is not FLIGHT or not possible(state.state):
+            self.hit.reset()
+            return state
+        if sample.factor == 1.0 and not state.revised and state.innovation @ state.innovation < SURELY:
             self.hit.reset()
             return state
         dt, measured = sample.time - samples[-2].time, (sample.position, sample.stated, sample.whole)
