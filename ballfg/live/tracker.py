@@ -306,6 +306,8 @@ class Tracker:
         if not hit:
             self._refuse_same(frame)
         rows, t = frame.open, frame.time
+        if not rows:
+            return
         balls = [ball for ball in self._balls if ball.accepts(t) and abs(t - ball.last) <= self.gap]
         costs = np.full((len(rows), len(balls)), FAR)
         for j, ball in enumerate(balls):
@@ -381,6 +383,8 @@ class Tracker:
 
     def _to_newcomers(self, frame: _Frame) -> None:
         rows, t = frame.open, frame.time
+        if not rows:
+            return
         newcomers = [newcomer for newcomer in self._newcomers if not newcomer.has(t)]
         costs = np.full((len(rows), len(newcomers)), FAR)
         for j, newcomer in enumerate(newcomers):
