@@ -31,6 +31,7 @@ SMALL: Final = 9  # Largest number of entries of an array that begins with zeros
 WRAPPED: Final[Mapping[str, Any]] = {"break_long_words": False, "break_on_hyphens": False, "drop_whitespace": True}
 TANGENTS: Final = 3  # Place of an array of tangents among the arguments of a function of a model
 WIDTH: Final = "d"  # Name of their number there
+TIGHT: Final = re.compile(r" ([-=+*/]) (?!-)")  # A space on both sides that C does not need
 CONSTANT: Final = re.compile(r" *const \w+ (\w+) = (?!.*\w_\w+\().*;")
 """A line that declares one without a call of another function of the text, which may have effects."""
 
@@ -197,16 +198,23 @@ class Body:
         routine = self.translator.routine(function)
         if routine.is_inlined():
             return self._inlined(routine, given)
+        width = given[TANGENTS].shape[2] if routine.generated else None
+        if width == 0:  # nobody reads or writes tangents then, those of the coefficients neither
+            x, c, w, *_, y, _ = given
+            none = [replace(v, shape=(*v.shape, 1), pointer="0", root="", fixed=False) for v in (x, c, y)]
+            given = [x, c, w, *none[:2], y, none[2]]
         passed = [leaf for value in given for leaf in leaves(value)]
         if routine.name in BY_HAND:
             passed = [*given, *(Constant(one.size) for one in given[-1:] if isinstance(one, Array))]
-        if routine.generated and (width := given[TANGENTS].shape[2]):
+        if width is not None:
             passed.append(Constant(width))
             given = [replace(v, shape=(*v.shape[:2], WIDTH)) if len(v.shape) > 2 else v for v in given]
         made = self.translator.made(routine, given)
         for one, written in zip(passed, made.written, strict=False):
             if written and isinstance(one, Array):
                 self.written.add(one.root)
+        asked = [*made.passed, *[True] * (len(passed) - len(made.passed))]
+        passed = [one for one, is_asked in zip(passed, asked, strict=True) if is_asked]
         texts = [one.pointer if isinstance(one, Array) else text_of(one) for one in passed]
         if not made.name:  # it does nothing with such arguments
             return ()
@@ -233,7 +241,10 @@ class Body:
         texts = "\n".join(self.lines)
         for root in sorted(roots):
             texts = texts.replace(f"<{root}>double *const", f"{'' if root in self.written else 'const '}double *const")
-        return _joined(_used([*lines, *texts.split("\n")]))
+        joined = _joined(_used([*lines, *texts.split("\n")]))
+        if self.routine.generated:  # steps of a calculation, which nobody reads: half of a header without their spaces
+            joined = [TIGHT.sub(r"\1", line) if line.lstrip().startswith("const double ") else line for line in joined]
+        return [part for line in joined for part in textwrap.wrap(line, 118, **WRAPPED) or [""]]
 
 
 def _used(lines: list[str]) -> list[str]:
@@ -255,7 +266,7 @@ def _joined(lines: Sequence[str]) -> list[str]:
             joined[-1] = f"{joined[-1][:-1]}, {line[start.end() :]}"
         else:
             joined.append(line)
-    return [part for line in joined for part in textwrap.wrap(line, 118, **WRAPPED) or [""]]
+    return joined
 
 
 def leaves_block(value: Value) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from ballfg.dynamics.compiled.in_c.body import TANGENTS, WIDTH, Body
+from ballfg.dynamics.compiled.in_c.body import WIDTH, Body
 from ballfg.dynamics.compiled.in_c.helpers import BY_HAND
 from ballfg.dynamics.compiled.in_c.statements import block
 from ballfg.dynamics.compiled.in_c.values import Array, UntranslatableError, Value, form
@@ -88,13 +88,15 @@ class Made:
     """A C function.
 
     Attributes: name: of it.  kind: of its result; None: none.  outputs: kinds of results that go to pointers.
-        written: whether each of the arguments that C gets is written to.
+        written: whether each of the arguments is written to.  passed: whether C gets it; those that nothing reads are
+            left out.
     """
 
     name: str
     kind: str | None
     outputs: Sequence[str]
     written: Sequence[bool]
+    passed: Sequence[bool]
 
 
 @dataclass
@@ -104,6 +106,7 @@ class Translator:
     prefix: str  # of their names
     texts: list[str] = field(default_factory=list)  # in an order in which each comes after what it calls
     _made: dict[tuple[Hashable, ...], Made] = field(default_factory=dict)
+    _texts: dict[tuple[Hashable, ...], str] = field(default_factory=dict)  # names of the functions, by their texts
     _routines: dict[Any, Routine] = field(default_factory=dict)
     _names: Counter[str] = field(default_factory=Counter)
 
@@ -131,7 +134,7 @@ class Translator:
         if not self._names[routine.name]:
             self._names[routine.name] += 1
             self.texts.append(text.replace("NAME", name))
-        return Made(name, None, (), written)
+        return Made(name, None, (), written, [True] * len(written))
 
     def _translated(self, routine: Routine, given: Sequence[Value], bound: Mapping[str, Value]) -> Made:
         body = Body(self, routine)
@@ -139,24 +142,34 @@ class Translator:
         arguments = body.take(given)
         block(body, routine.tree.body)
         if not body.lines:
-            return Made("", None, (), [False] * len(arguments))
-        self._names[routine.name] += 1
-        number = self._names[routine.name]
-        name = f"{self.prefix}_{routine.name}" + (f"_{number}" if number > 1 else "")
+            return Made("", None, (), [False] * len(arguments), [False] * len(arguments))
         kind, outputs = body.result()
-        passed = [
-            f"{'' if a.root in body.written else 'const '}double *{a.pointer}"
-            if isinstance(a, Array)
-            else f"{a.kind} {a.text}"
-            for a in arguments
-        ]
-        passed += [f"int {WIDTH}" for a in arguments[:1] if routine.generated and not given[TANGENTS].empty]
-        passed += [f"{one} *out{k}" for k, one in enumerate(outputs)]
-        told = (ast.get_docstring(routine.tree) or f"The {routine.name} of the model.").splitlines()[0]
-        head = f"static inline {kind or 'void'} {name}({', '.join(passed) or 'void'}) {{"
         lines = body.finished()
         words = set(re.findall(r"\w+", "\n".join(lines)))
-        unused = [leaf for a in arguments if (leaf := a.pointer if isinstance(a, Array) else a.text) not in words]
-        above = [f"/* {told} */"] if number == 1 else []
-        self.texts.append("\n".join([*above, head, *(f" (void){leaf};" for leaf in unused), *lines, "}"]))
-        return Made(name, kind, outputs, [isinstance(a, Array) and a.root in body.written for a in arguments])
+        names = [a.pointer if isinstance(a, Array) else a.text for a in arguments]
+        passed = [bool(bound) or name in words for name in names]  # whoever calls from outside gives all
+        given_to_c = [
+            f"{'' if a.root in body.written else 'const '}double *{name}"
+            if isinstance(a, Array)
+            else f"{a.kind} {name}"
+            for a, name, is_passed in zip(arguments, names, passed, strict=True)
+            if is_passed
+        ]
+        given_to_c += [f"int {WIDTH}" for _ in arguments[:1] if routine.generated]
+        given_to_c += [f"{one} *out{k}" for k, one in enumerate(outputs)]
+        unread = [f" (void){name};" for name in names if bound and name not in words]
+        text = f"({', '.join(given_to_c) or 'void'}) {{", *unread, *lines, "}"
+        name = self._named(routine, kind or "void", text)
+        return Made(name, kind, outputs, [isinstance(a, Array) and a.root in body.written for a in arguments], passed)
+
+    def _named(self, routine: Routine, kind: str, text: Sequence[str]) -> str:
+        """The name of the function with a text after its name: that of an earlier one with the same text, if any."""
+        key = (routine, kind, *text)
+        if key not in self._texts:
+            self._names[routine.name] += 1
+            number = self._names[routine.name]
+            self._texts[key] = f"{self.prefix}_{routine.name}" + (f"_{number}" if number > 1 else "")
+            told = (ast.get_docstring(routine.tree) or f"The {routine.name} of the model.").splitlines()[0]
+            above = [f"/* {told} */"] if number == 1 else []
+            self.texts.append("\n".join([*above, f"static inline {kind} {self._texts[key]}{text[0]}", *text[1:]]))
+        return self._texts[key]
