@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
+from ballfg.arrays import Mask
 from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, analytic, hold_out
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
@@ -16,7 +15,7 @@ from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Settings, dataset_settings
 from ballfg.estimation.noise.estimate import linearised
 from ballfg.estimation.noise.linear_tracks import LinearTracks
-from ballfg.estimation.noise.parameters import tensors_of
+from ballfg.estimation.noise.parameters import noise_of
 from ballfg.estimation.noise.sources import SOURCES, squares_by_source
 from ballfg.tracks import Dataset
 
@@ -82,27 +81,27 @@ def expected_squares(
     if linear is None:
         return None
     observed, predicted = _samples(linear, tracks)
-    predicted &= (predicted.sum(dim=1) >= LEAST_PREDICTED)[:, None]
+    predicted &= (predicted.sum(axis=1) >= LEAST_PREDICTED)[:, None]
     if not bool(predicted.any()):
         return None
     if settings.launcher is not None:
         settings = replace(settings, spin_label_noise=settings.launcher.sigma)
-    noise = tensors_of([], torch.empty((1, 0), dtype=torch.float64), settings)
-    squares = squares_by_source(linear, noise, settings.velocity_prior, observed, predicted).sum(dim=0)
+    noise = noise_of([], np.empty((1, 0)), settings)
+    squares = squares_by_source(linear, noise, settings.velocity_prior, observed, predicted).sum(axis=0)
     means = (1e6 * squares / predicted.sum()).tolist()
-    return dict(zip(SOURCES, means, strict=True)), int(predicted.any(dim=1).sum())
+    return dict(zip(SOURCES, means, strict=True)), int(predicted.any(axis=1).sum())
 
 
-def _samples(linear: LinearTracks, tracks: Sequence[EvaluationTrack]) -> tuple[Tensor, Tensor]:
+def _samples(linear: LinearTracks, tracks: Sequence[EvaluationTrack]) -> tuple[Mask, Mask]:
     """(t, n) bool, observed and predicted samples of the tracks that are linearised as a whole; none of the others.
 
     Nor of those of which most observed samples are outliers: a prediction knows what this linearisation leaves out.
     """
     observed, predicted = np.zeros((2, *linear.times.shape), dtype=bool)
     for row, number in enumerate(linear.numbers):
-        track, moving = tracks[number].track, np.diff(linear.times[row].numpy()) > 0.0
+        track, moving = tracks[number].track, np.diff(linear.times[row]) > 0.0
         if np.flatnonzero(moving)[-1] + 2 == len(track):
             seen = len(track.opening(OBSERVED * track.duration))
-            if linear.used[row, :seen].double().mean() > 0.5:
+            if linear.used[row, :seen].mean() > 0.5:
                 observed[row, :seen], predicted[row, seen : len(track)] = True, True
-    return torch.from_numpy(observed), torch.from_numpy(predicted)
+    return observed, predicted

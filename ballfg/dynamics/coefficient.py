@@ -15,6 +15,9 @@ THIN_SHELL: Final = 2.0 / 3.0  # Moment of inertia of a thin spherical shell div
 _OF_BOUNCE: Final = re.compile(r"^((?:model\.|base\.)*)contact\.")
 
 
+DOUBT: Final = "fading."  # Prefix of the names of what a `LearnedModel` doubts in its correction
+
+
 @dataclass(frozen=True)
 class Coefficient:
     """One number of an effect: its name, nominal value, prior spread, unit, bounds and where they come from."""

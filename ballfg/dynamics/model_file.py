@@ -10,7 +10,7 @@ import yaml
 
 from ballfg.checks import check_path, check_range, shown
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
-from ballfg.dynamics.coefficient import THIN_SHELL, todays_name
+from ballfg.dynamics.coefficient import DOUBT, THIN_SHELL, todays_name
 from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import EFFECTS, GENERIC, LEARNED, effect_class
@@ -211,7 +211,7 @@ def check_spreads(noise: TrackNoise | None, model: BallModel, where: str) -> Non
     for name in others:
         effects = {**EFFECTS, **GENERIC, **LEARNED}.values()
         every = tuple(f"{effect.kind}.{effect.name}.{c.name}" for effect in effects for c in effect.coefficients)
-        from ballfg.dynamics.networks.fading import DOUBT, DOUBTS  # networks are imported where a file names one
+        from ballfg.dynamics.networks.fading import DOUBTS  # networks are imported where a file names one
 
         plain = todays_name(name).removeprefix(BASE)  # a network's file names the coefficients of its base
         if plain not in (*own, *every, *(DOUBT + c.name for c in DOUBTS)):

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ballfg.checks import shown
-from ballfg.dynamics.compiled.kept_model import content_of
+from ballfg.dynamics.coefficient import DOUBT
+from ballfg.dynamics.compiled.kept_model import KeptModel, content_of
 from ballfg.dynamics.population import SpinPopulation
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
@@ -159,6 +160,9 @@ _FITTED: dict[tuple[Dataset | SightedDataset, Hashable, float], Settings | None]
 
 def _content(model: BallModel) -> Hashable:
     """Equal for analytic models with equal content, which every call of the front door makes or loads anew."""
+    if type(model) is KeptModel and (content := model.content) is not None:
+        stated = repr((model.radius, model.inertia_factor, content, model.declared_coefficients()))
+        return stated, tuple(part.source for part in model.functions.parts)
     from ballfg.dynamics.analytic import AnalyticModel
 
     values = tuple(p.detach().numpy().tobytes() for p in model.parameters())
@@ -192,8 +196,6 @@ def tracks_settings(
         settings: prior ones; for a trained model, with the noise of its training.
         position_known: True if the white noise of positions is stated.  watch: as for `fitted_settings`.
     """
-    from ballfg.dynamics.networks.fading import DOUBT
-
     doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
     outside = _share_outside(model, surfaces, plain, parts)

@@ -95,7 +95,6 @@ def _rows(number: int, size: int, most: int) -> Index:
     return np.asarray((np.arange(count) + begin) * size / count).astype(np.int64)
 
 
-DOUBT: Final = "fading."  # Prefix of the doubts' names in a `LearnedModel`
 ABROAD: Final = 0.5
 """Largest share of a correction that is used in a room outside of the training: a few rooms cannot separate the ball's
 part of a correction from theirs. Whichever it is, at least half of it is right."""

@@ -7,13 +7,13 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from ballfg.dynamics.coefficient import THIN_SHELL
+from ballfg.dynamics.coefficient import DOUBT, THIN_SHELL
 from ballfg.dynamics.effect import Coefficient, per_row
 from ballfg.dynamics.effects.bounce import TableHeight
 from ballfg.dynamics.model import BASE, BallModel, Rates
 from ballfg.dynamics.networks import gram_schmidt
 from ballfg.dynamics.networks.architecture import Architecture
-from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading
+from ballfg.dynamics.networks.fading import DOUBTS, Fading
 from ballfg.dynamics.networks.gram_schmidt import SPEED_SCALE, SPIN_SCALE
 from ballfg.dynamics.networks.layers import MLP, MNN, NETWORKS, NetworkKind, Skip
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ

@@ -13,7 +13,6 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import check_each, check_flag, check_instance, check_range
-from ballfg.deferred import torch
 from ballfg.dynamics.compiled.kept_model import check_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.batch import map_tracks
@@ -25,9 +24,10 @@ from ballfg.estimation.noise.marginal import scatter_of
 from ballfg.estimation.noise.parameters import (
     COEFFICIENTS,
     Parameter,
+    by_logs,
     coefficient_factors,
+    noise_of,
     parameters_of,
-    tensors_of,
     track_noise,
     with_noise,
 )
@@ -238,7 +238,7 @@ def linearised(
     if found is None or settings.launcher is not None:  # whose spins are no labels
         return found
     spread = plain.spin_label_noise / settings.spin_label_noise
-    return replace(found, label_spreads=torch.full_like(found.label_spreads, spread))
+    return replace(found, label_spreads=np.full_like(found.label_spreads, spread))
 
 
 def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> list[T]:
@@ -266,12 +266,12 @@ class _Search:
 
     def value(self, logs: Array) -> tuple[float, Array]:
         """Negative log posterior and its gradient (k,); every start counts as one observation."""
-        leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
-        score = self.forecaster.score(tensors_of(self.parameters, leaf[None], self.settings)).value
-        (gradient,) = torch.autograd.grad(score, leaf)
+        noise = noise_of(self.parameters, logs[None], self.settings)
+        score = self.forecaster.score(noise)
+        gradient = by_logs(self.parameters, noise, score.slopes).sum(axis=0)
         away = (logs - self.start) / self.spread
-        value = self.weight * float(score.detach()) + 0.5 * float(away @ away)
-        return value, self.weight * gradient.numpy() + away / self.spread
+        value = self.weight * score.value + 0.5 * float(away @ away)
+        return value, self.weight * gradient + away / self.spread
 
     def minimised(self, tick: Callable[[], object]) -> Array:
         """(k,) logarithms at the minimum."""
@@ -300,14 +300,9 @@ class _Search:
 
     def _scatter(self, logs: Array) -> Array:
         """(k, k) sum over tracks of the squares of their gradients about the mean."""
-        leaf = torch.tensor(np.tile(logs, (self.forecaster.count, 1)), dtype=torch.float64, requires_grad=True)
-        score = self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).value
-        return scatter_of(self.weight * torch.autograd.grad(score, leaf)[0].numpy())
+        noise = noise_of(self.parameters, logs[None], self.settings)
+        return scatter_of(self.weight * by_logs(self.parameters, noise, self.forecaster.score(noise).slopes))
 
     def held(self, logs: Array) -> float:
         """Share of forecast coordinates inside their 90 % intervals."""
-        with torch.no_grad():
-            noise = tensors_of(
-                self.parameters, torch.from_numpy(np.asarray(logs[None], dtype=np.float64)), self.settings
-            )
-            return self.forecaster.score(noise).held
+        return self.forecaster.score(noise_of(self.parameters, np.asarray(logs)[None], self.settings)).held

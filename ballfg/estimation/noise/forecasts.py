@@ -9,19 +9,18 @@ noise that forecasts leave undetermined.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from ballfg.deferred import torch
+from ballfg.arrays import Array, Index
 from ballfg.estimation.noise.linear_filter import Filtered, LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks.stamps import STAMP_TOLERANCE
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 HORIZONS: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """s ahead of a start; the first good sample at or after each is scored."""
@@ -44,13 +43,19 @@ class Score:
         held: share of forecast coordinates inside the central 90 % intervals.
     """
 
-    by_track: Tensor
+    by_track: Array
     held: float
+    derivatives: Callable[[], Noise]
 
     @property
-    def value(self) -> Tensor:
-        """() the mean over all tracks."""
-        return self.by_track.sum()
+    def value(self) -> float:
+        """The mean over all tracks."""
+        return float(self.by_track.sum())
+
+    @cached_property
+    def slopes(self) -> Noise:
+        """The derivatives of `by_track` by the noise, a row for each track."""
+        return self.derivatives()
 
 
 class Forecaster:
@@ -84,41 +89,88 @@ class Forecaster:
         self.starts = self._starts(earliest, every)
         self._ahead = _Ahead.of(tracks, self.starts)
 
-    def _starts(self, earliest: float, every: float) -> Tensor:
+    def _starts(self, earliest: float, every: float) -> Index:
         found = []
-        for track, (times, used) in enumerate(zip(self.tracks.times.numpy(), self.tracks.used.numpy(), strict=True)):
+        for track, (times, used) in enumerate(zip(self.tracks.times, self.tracks.used, strict=True)):
             last = times[used][-1] if used.any() else 0.0
             moments = np.arange(earliest, last - HORIZONS[0] + STAMP_TOLERANCE, every)
             found += [(track, k) for k in np.unique(np.searchsorted(times, moments - STAMP_TOLERANCE)).tolist()]
-        return torch.tensor(found, dtype=torch.int64).reshape(-1, 2)
+        return np.array(found, dtype=np.int64).reshape(-1, 2)
 
     def score(self, noise: Noise) -> Score:
         """The score of some noise."""
         measured = self.filter.measured(noise)
         filtered = self.filter.run(noise, measured)
-        total, inside, count = self._forecast(filtered, noise, measured)
-        by_track = total / max(count, 1) + self.next_samples * filtered.nll / max(filtered.count, 1)
-        return Score(by_track, inside / max(3 * count, 1))
+        looked, weight = self._look(filtered, noise, measured), self.next_samples / max(filtered.count, 1)
+        count = max(len(looked.scores), 1)
+        by_track = np.bincount(self._ahead.track, looked.scores, self.count) / count + weight * filtered.nll
+        derivatives = partial(self._slopes, filtered, noise, looked, count, weight)
+        return Score(by_track, looked.inside / (3 * count), derivatives)
 
-    def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
-        """(t,) summed scores of forecasts, number of coordinates in their 90 % intervals, number of forecasts."""
-        ahead = self._ahead
+    def _look(self, filtered: Filtered, noise: Noise, measured: Array) -> _Looked:
+        """All forecasts beside what was measured."""
+        ahead, own = self._ahead, self.filter.own
         mean, covariance = filtered.means[ahead.track, ahead.start], filtered.covariances[ahead.track, ahead.start]
-        process = noise.process.square().expand(self.count, -1)[ahead.track]
-        observe, gathered = ahead.by_state, (ahead.kicks @ process[..., None])[..., 0]
+        variance = np.einsum("saq,sq->sa", ahead.kicks, filtered.variances.process[ahead.track])
+        observe, decay = ahead.by_state, np.zeros(len(mean))
         if self.filter.biases:
-            time, memory = (x.expand(self.count, *x.shape[1:])[ahead.track] for x in (noise.memory_time, noise.memory))
-            decay = torch.exp(-ahead.elapsed / time)
-            observe = torch.cat((observe, decay[:, None, None] * torch.eye(3, dtype=torch.float64)), dim=2)
-            gathered = gathered + memory * (1.0 - decay.square())[:, None]
-        new = torch.diagonal(measured[ahead.track, ahead.sample], dim1=-2, dim2=-1)
-        variance = ((observe @ covariance) * observe).sum(dim=2) + gathered + new
+            decay = np.exp(-ahead.elapsed / np.broadcast_to(noise.memory_time, self.count)[ahead.track])
+            observe = np.concatenate((observe, decay[:, None, None] * np.eye(3)), axis=2)
+            variance += filtered.variances.memory[ahead.track] * (1.0 - decay**2)[:, None]
+        known = observe @ covariance
+        variance += (known * observe).sum(axis=2) + np.diagonal(measured[ahead.track, ahead.sample], axis1=1, axis2=2)
         predicted = (observe @ mean[..., None])[..., 0] + ahead.offsets
-        square = (self.tracks.errors[ahead.track, ahead.sample] - predicted).square() / variance
-        beyond = TAIL * square.clamp(min=1e-12).sqrt() - 0.5 * TAIL**2
-        scores = (torch.where(square < TAIL**2, 0.5 * square, beyond) + 0.5 * variance.log()).sum(dim=1)
-        total = torch.zeros(self.count, dtype=torch.float64).index_add(0, ahead.track, scores)
-        return total, float((square.detach() < NINETY**2).sum()), len(scores)
+        error = self.tracks.errors[ahead.track, ahead.sample] - predicted
+        square = error**2 / variance
+        near, size = square < TAIL**2, np.sqrt(np.maximum(square, 1e-12))
+        scores = np.where(near, 0.5 * square, TAIL * size - 0.5 * TAIL**2) + 0.5 * np.log(variance)
+        slope = np.where(near, 0.5, 0.5 * TAIL / size)  # by the square
+        by_predicted, by_variance = -2.0 * slope * error / variance, (0.5 - slope * square) / variance
+        by_observe = by_predicted[..., None] * mean[:, None, :] + 2.0 * by_variance[..., None] * known
+        by_decay = by_observe[:, range(3), range(own, own + 3)].sum(axis=1) if self.filter.biases else decay
+        inside = float((square < NINETY**2).sum())
+        return _Looked(scores.sum(axis=1), inside, observe, decay, by_predicted, by_variance, by_decay)
+
+    def _slopes(self, filtered: Filtered, noise: Noise, looked: _Looked, count: int, weight: float) -> Noise:
+        """The derivatives of the score by the noise. Args: weight: of the densities of the next samples."""
+        ahead, share = self._ahead, 1.0 / count
+        by_variance = share * looked.by_variance
+        begins, ends = (ahead.track, ahead.start), (ahead.track, ahead.sample)
+        by_means, by_covariances = np.zeros(filtered.means.shape), np.zeros(filtered.covariances.shape)
+        np.add.at(by_means, begins, share * np.einsum("saw,sa->sw", looked.observe, looked.by_predicted))
+        weighted = (looked.observe * by_variance[..., None]).swapaxes(1, 2) @ looked.observe
+        np.add.at(by_covariances, begins, weighted)
+        by, by_decays = self.filter.slopes(filtered, weight, (by_means, by_covariances))
+        for axis in range(3):
+            np.add.at(by.measured[..., axis, axis], ends, by_variance[:, axis])
+        np.add.at(by.process, ahead.track, np.einsum("sa,saq->sq", by_variance, ahead.kicks))
+        if not self.filter.biases:
+            return self.filter.noise_slopes(noise, filtered, by, by_decays)
+        decay, memory = looked.decay, filtered.variances.memory[ahead.track]
+        np.add.at(by.memory, ahead.track, by_variance * (1.0 - decay**2)[:, None])
+        late = share * looked.by_decay - 2.0 * decay * (by_variance * memory).sum(axis=1)
+        found = self.filter.noise_slopes(noise, filtered, by, by_decays)
+        through = np.bincount(ahead.track, late * decay * ahead.elapsed, self.count) / noise.memory_time**2
+        return replace(found, memory_time=found.memory_time + through)
+
+
+class _Looked(NamedTuple):
+    """What comes of s forecasts.
+
+    Attributes:
+        scores: (s,).  inside: number of coordinates in their 90 % intervals.
+        observe: (s, 3, w) derivative of the position by the filter's state.  decay: (s,) of the memory.
+        by_predicted, by_variance, by_decay: (s, 3), (s, 3) and (s,) derivatives of the scores by the predicted
+            position, its variance, and the decay as it stands in `observe`.
+    """
+
+    scores: Array
+    inside: float
+    observe: Array
+    decay: Array
+    by_predicted: Array
+    by_variance: Array
+    by_decay: Array
 
 
 @dataclass(frozen=True)
@@ -133,38 +185,36 @@ class _Ahead:
         offsets: (s, 3) m, the sum of the estimate's offsets on the way.
     """
 
-    track: Tensor
-    start: Tensor
-    sample: Tensor
-    elapsed: Tensor
-    by_state: Tensor
-    kicks: Tensor
-    offsets: Tensor
+    track: Index
+    start: Index
+    sample: Index
+    elapsed: Array
+    by_state: Array
+    kicks: Array
+    offsets: Array
 
     @classmethod
-    def of(cls, tracks: LinearTracks, starts: Tensor) -> _Ahead:
+    def of(cls, tracks: LinearTracks, starts: Index) -> _Ahead:
         """All forecasts from some origins (r, 2), track and sample."""
         (track, start), (samples, own) = starts.T, (tracks.times.shape[1], tracks.transitions.shape[-1])
-        begin, reached = tracks.times[track, start], torch.zeros(len(track), dtype=torch.float64)
-        horizons, found = torch.tensor(HORIZONS, dtype=torch.float64), []
-        way = torch.eye(own, dtype=torch.float64).expand(len(track), own, own)
-        kicks = torch.zeros((len(track), *tracks.kicks.shape[2:]), dtype=torch.float64)
-        shifted = torch.zeros((len(track), own), dtype=torch.float64)
+        begin, reached, horizons, found = tracks.times[track, start], np.zeros(len(track)), np.array(HORIZONS), []
+        way, shifted = np.tile(np.eye(own), (len(track), 1, 1)), np.zeros((len(track), own))
+        kicks = np.zeros((len(track), *tracks.kicks.shape[2:]))
         for ahead in range(1, samples):
-            interval = (start + ahead - 1).clamp(max=samples - 2)
+            interval = np.minimum(start + ahead - 1, samples - 2)
             step = tracks.transitions[track, interval]
             moved = step[:, None, :STATE_DIM, :STATE_DIM]
-            way, kicks = step @ way, moved @ kicks @ moved.mT + tracks.kicks[track, interval]
+            way, kicks = step @ way, moved @ kicks @ moved.swapaxes(-1, -2) + tracks.kicks[track, interval]
             shifted = (step @ shifted[..., None])[..., 0] + tracks.offsets[track, interval]
-            sample = (start + ahead).clamp(max=samples - 1)
+            sample = np.minimum(start + ahead, samples - 1)
             elapsed = tracks.times[track, sample] - begin
             fresh = (start + ahead < samples) & tracks.used[track, sample]
-            due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None] + STAMP_TOLERANCE)).any(dim=1)
-            rows = torch.nonzero(fresh & due)[:, 0]
-            reached = torch.where(fresh, elapsed + STAMP_TOLERANCE, reached)
-            gathered = torch.diagonal(kicks[rows][..., POSITION, POSITION], dim1=-2, dim2=-1).mT
+            due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None] + STAMP_TOLERANCE)).any(axis=1)
+            rows = np.flatnonzero(fresh & due)
+            reached = np.where(fresh, elapsed + STAMP_TOLERANCE, reached)
+            gathered = np.diagonal(kicks[rows][..., POSITION, POSITION], axis1=-2, axis2=-1).swapaxes(-1, -2)
             found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, shifted[rows, POSITION]))
-            if bool((reached >= HORIZONS[-1]).all()):
+            if (reached >= HORIZONS[-1]).all():
                 break
-        rows, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))
+        rows, *rest = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return cls(track[rows], start[rows], *rest)

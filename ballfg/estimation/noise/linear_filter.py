@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from ballfg.deferred import torch
-from ballfg.estimation.noise.filter_code import NEXT_FROM
+import numpy as np
+
+from ballfg.arrays import Array, plain
+from ballfg.estimation.noise.filter_code import NEXT_FROM, filter_tracks
+from ballfg.estimation.noise.filter_derivative import pull_back
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import LEAST_NOISE
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 BIAS_DIM: Final = 3
 
 
 @dataclass(frozen=True)
 class Noise:
-    """All noise as tensors, differentiable: a row for each track, r = t, or one row for all, r = 1.
+    """All noise, or derivatives by it: a row for each track, r = t, or one row for all, r = 1.
 
     Attributes:
         position: (r, 3) multiples of the white standard deviations of the samples.
@@ -28,19 +28,19 @@ class Noise:
         coefficients: (r, p) multiples of their prior standard deviations; (r, 1) one for all.
     """
 
-    position: Tensor
-    memory: Tensor
-    memory_time: Tensor
-    stamp_jitter: Tensor
-    process: Tensor
-    spin_label: Tensor
-    spin_prior: Tensor
-    coefficients: Tensor
+    position: Array
+    memory: Array
+    memory_time: Array
+    stamp_jitter: Array
+    process: Array
+    spin_label: Array
+    spin_prior: Array
+    coefficients: Array
 
 
 @dataclass(frozen=True)
 class Variances:
-    """The variances of all sources of error of t tracks of n samples.
+    """The variances of all sources of error of t tracks of n samples, or derivatives by them.
 
     Attributes:
         process: (t, 7) squares of the numbers of `PROCESS_NOISE`.
@@ -49,10 +49,10 @@ class Variances:
         measured: (t, n, 3, 3) m^2, of the white error of a measured position.
     """
 
-    process: Tensor
-    memory: Tensor
-    prior: Tensor
-    measured: Tensor
+    process: Array
+    memory: Array
+    prior: Array
+    measured: Array
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,17 @@ class Filtered:
         covariances: (t, n, w, w).
         nll: (t,) summed negative logarithms of the density of each next sample.
         count: number of these samples.
+        variances: of the sources.  decays: (t, n - 1) of the memory.
+        steps: further results of machine code, which the derivatives need.
     """
 
-    means: Tensor
-    covariances: Tensor
-    nll: Tensor
+    means: Array
+    covariances: Array
+    nll: Array
     count: int
+    variances: Variances
+    decays: Array
+    steps: tuple[Array, ...]
 
 
 class LinearFilter:
@@ -89,51 +94,98 @@ class LinearFilter:
         self.own = tracks.transitions.shape[-1]
         self.biases = BIAS_DIM if biased else 0
         self.width = self.own + self.biases
-        self.first = torch.nn.functional.pad(tracks.starts, (0, self.biases)).contiguous().numpy()
-        self.seen = tracks.used.to(torch.int64).numpy()
+        self.first = np.pad(tracks.starts, ((0, 0), (0, self.biases)))
+        self.seen = tracks.used.astype(np.int64)
         self._scored = int(tracks.used[:, NEXT_FROM:].sum())
 
-    def measured(self, noise: Noise) -> Tensor:
+    def measured(self, noise: Noise) -> Array:
         """(t, n, 3, 3) m^2, covariance of the white error of a measured position."""
-        way = self.tracks.velocities
-        along = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
-        return along + torch.diag_embed(self.white(noise))
+        way, white = self.tracks.velocities, self.white(noise)
+        found = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
+        for axis in range(3):
+            found[..., axis, axis] += white[..., axis]
+        return np.asarray(found)
 
-    def white(self, noise: Noise) -> Tensor:
+    def white(self, noise: Noise) -> Array:
         """(t, n, 3) m^2, variances of the samples' white errors without those of the stamps."""
-        white = noise.position[:, None, :] * self.tracks.white
-        return white.clamp_min(LEAST_NOISE).square()  # an axis may have no noise
+        return np.asarray(
+            np.maximum(noise.position[:, None, :] * self.tracks.white, LEAST_NOISE) ** 2
+        )  # some have none
 
-    def losses(self, noise: Noise) -> Tensor:
-        """(t,) negative logarithms of the marginal likelihood of each track."""
-        return self.run(noise, self.measured(noise)).nll
+    def losses(self, noise: Noise) -> tuple[Array, Noise]:
+        """(t,) negative logarithms of the marginal likelihood of each track, and their derivatives by the noise."""
+        filtered = self.run(noise, self.measured(noise))
+        return filtered.nll, self.noise_slopes(noise, filtered, *self.slopes(filtered, 1.0))
 
-    def run(self, noise: Noise, measured: Tensor) -> Filtered:
-        """The filter over all samples, differentiable by the noise.
+    def run(self, noise: Noise, measured: Array) -> Filtered:
+        """The filter over all samples.
 
         Args:
             noise: all of it.
             measured: (t, n, 3, 3) m^2, the result of `measured`.
-        Raises: torch.linalg.LinAlgError: the covariance of an innovation is not positive definite.
+        Raises: numpy.linalg.LinAlgError: the covariance of an innovation is not positive definite.
         """
         return self.run_with(self.variances(noise, measured), noise.memory_time)
 
-    def variances(self, noise: Noise, measured: Tensor) -> Variances:
+    def variances(self, noise: Noise, measured: Array) -> Variances:
         """The variances of all sources of error under some noise; arguments as those of `run`."""
         tracks, count = self.tracks, self.count
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
-        return Variances(noise.process.square().expand(count, -1), noise.memory.expand(count, -1), prior, measured)
+        process, memory = (np.tile(x, (count // len(x), 1)) for x in (noise.process**2, noise.memory))
+        return Variances(process, memory, prior, measured)
 
-    def run_with(self, variances: Variances, memory_time: Tensor) -> Filtered:
-        """The filter for the variances of all sources of error, differentiable by them.
+    def run_with(self, variances: Variances, memory_time: Array) -> Filtered:
+        """The filter for the variances of all sources of error.
 
         Args: variances: of all sources.  memory_time: (r,) s.
-        Raises: torch.linalg.LinAlgError: as `run`.
+        Raises: numpy.linalg.LinAlgError: as `run`.
         """
-        decays = torch.exp(-torch.diff(self.tracks.times, dim=1) / memory_time[:, None])
-        memory = variances.memory
-        prior = torch.cat((variances.prior, memory[:, : self.biases]), dim=1)
-        from ballfg.estimation.noise.differentiable_filter import FilterRun
+        tracks, shape, width = self.tracks, (self.count, self.samples), self.width
+        decays = np.exp(-np.diff(tracks.times, axis=1) / memory_time[:, None])
+        prior = np.concatenate((variances.prior, variances.memory[:, : self.biases]), axis=1)
+        sizes = (width,), (width, width), (width, 3), (3, 3), (3,), ()
+        made, nll = [np.empty(shape + size) for size in sizes], np.empty(self.count)
+        moved = tracks.transitions, tracks.offsets, tracks.kicks
+        given = plain(variances.process), decays, plain(variances.memory), plain(variances.measured)
+        if not filter_tracks(*moved, *given, tracks.errors, self.seen, self.first, prior, *made, nll):
+            raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+        return Filtered(made[0], made[1], nll, self._scored, variances, decays, tuple(made[2:]))
 
-        means, covariances, nll = FilterRun.apply(self, variances.process, decays, memory, prior, variances.measured)
-        return Filtered(means, covariances, nll, self._scored)
+    def slopes(
+        self, filtered: Filtered, by_nll: Array | float = 0.0, by_states: tuple[Array, Array] | None = None
+    ) -> tuple[Variances, Array]:
+        """Derivatives of a function of the results by the variances, and (t, n - 1) by the decays of the memory.
+
+        Args:
+            filtered: the results.  by_nll: (t,) derivatives of the function by the densities, or one for all.
+            by_states: derivatives by means (t, n, w) and covariances (t, n, w, w); None if it depends on none.
+        """
+        tracks, (count, samples, width) = self.tracks, filtered.means.shape
+        if by_states is None:
+            by_states = np.empty((count, 0, width)), np.empty((count, 0, width, width))
+        sizes = (tracks.kicks.shape[2],), (samples - 1,), (BIAS_DIM,), (width,), (samples, 3, 3)
+        process, decays, memory, prior, measured = found = [np.empty((count, *size)) for size in sizes]
+        moved = tracks.transitions, tracks.kicks, filtered.decays, plain(filtered.variances.memory), self.seen
+        results = filtered.means, filtered.covariances, *filtered.steps
+        pull_back(*moved, *results, *by_states, np.full(count, by_nll, dtype=np.float64), *found)
+        memory[:, : self.biases] += prior[:, self.own :]
+        return Variances(process, memory, prior[:, : self.own], measured), decays
+
+    def noise_slopes(self, noise: Noise, filtered: Filtered, by: Variances, by_decays: Array) -> Noise:
+        """Derivatives (t, ...) by the noise from those by the variances and decays, one row for each track."""
+        tracks, way, step = self.tracks, self.tracks.velocities, np.diff(self.tracks.times, axis=1)
+        size = noise.position[:, None, :] * tracks.white
+        by_white = np.where(size >= LEAST_NOISE, 2.0 * size * np.diagonal(by.measured, axis1=2, axis2=3), 0.0)
+        spin, label, coefficients = tracks.prior_slopes(
+            noise.spin_prior, noise.spin_label, noise.coefficients, by.prior
+        )
+        return Noise(
+            position=(by_white * tracks.white).sum(axis=1),
+            memory=by.memory,
+            memory_time=(by_decays * filtered.decays * step).sum(axis=1) / noise.memory_time**2,
+            stamp_jitter=np.einsum("tni,tnij,tnj->t", way, by.measured, way, optimize=True),
+            process=2.0 * noise.process * by.process,
+            spin_label=label,
+            spin_prior=spin,
+            coefficients=coefficients,
+        )

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.deferred import torch
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.segmentation.result import Quality
 from ballfg.estimation.settings import sample_sigmas
@@ -28,9 +27,6 @@ from ballfg.factors.noise import PROCESS_NOISE, Kicks
 from ballfg.progress import Watch, unwatched
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 LEAST_SAMPLES = 6
 """Least number of samples: the fit of a shorter track absorbs all of its noise."""
@@ -61,24 +57,24 @@ class LinearTracks:
     """
 
     numbers: Array
-    times: Tensor
-    errors: Tensor
-    white: Tensor
-    velocities: Tensor
-    used: Tensor
-    transitions: Tensor
-    offsets: Tensor
-    kicks: Tensor
-    starts: Tensor
-    labelled: Tensor
-    group_sigmas: Tensor
-    label_spreads: Tensor
-    coefficient_sigmas: Tensor
+    times: Array
+    errors: Array
+    white: Array
+    velocities: Array
+    used: NDArray[np.bool_]
+    transitions: Array
+    offsets: Array
+    kicks: Array
+    starts: Array
+    labelled: NDArray[np.bool_]
+    group_sigmas: Array
+    label_spreads: Array
+    coefficient_sigmas: Array
 
     def __len__(self) -> int:
         return len(self.times)
 
-    def prior_variances(self, spin: Tensor, label: Tensor, coefficients: Tensor, velocity: float) -> Tensor:
+    def prior_variances(self, spin: Array, label: Array, coefficients: Array, velocity: float) -> Array:
         """(t, d) of the first state and the coefficients.
 
         Args:
@@ -87,12 +83,22 @@ class LinearTracks:
             coefficients: (r, p) multiples of `coefficient_sigmas`.
             velocity: m/s, standard deviation per axis.
         """
-        count = len(self)
-        spins = torch.where(self.labelled, self.label_spreads * label, spin)[:, None].expand(count, 3)
-        spins = torch.where(self.group_sigmas.isnan(), spins, self.group_sigmas).square()
-        fixed = torch.tensor([START_POSITION_SIGMA**2] * 3 + [velocity**2] * 3, dtype=torch.float64)
-        own = (coefficients * self.coefficient_sigmas).square()
-        return torch.cat((fixed.expand(count, 6), spins, own.expand(count, -1)), dim=1)
+        spins = np.where(np.isnan(self.group_sigmas), self._own_spins(spin, label)[:, None], self.group_sigmas)
+        fixed = np.tile([START_POSITION_SIGMA**2] * 3 + [velocity**2] * 3, (len(self), 1))
+        own = np.tile((coefficients * self.coefficient_sigmas) ** 2, (len(self) // len(coefficients), 1))
+        return np.concatenate((fixed, spins**2, own), axis=1)
+
+    def prior_slopes(self, spin: Array, label: Array, coefficients: Array, by: Array) -> tuple[Array, Array, Array]:
+        """Derivatives (t,) by spin and label and (t, p) by coefficients, from those by `prior_variances`, (t, d)."""
+        own = np.where(np.isnan(self.group_sigmas), 2.0 * by[:, SPIN], 0.0).sum(axis=1) * self._own_spins(spin, label)
+        multiples = 2.0 * coefficients * self.coefficient_sigmas**2 * by[:, STATE_DIM:]
+        if coefficients.shape[1] == 1:  # one for all
+            multiples = multiples.sum(axis=1, keepdims=True)
+        return np.where(self.labelled, 0.0, own), np.where(self.labelled, self.label_spreads * own, 0.0), multiples
+
+    def _own_spins(self, spin: Array, label: Array) -> Array:
+        """(t,) rad/s, standard deviation of each first spin by its label, or without one."""
+        return np.asarray(np.where(self.labelled, self.label_spreads * label, spin))
 
 
 _Piece = dict[str, Array]
@@ -119,7 +125,7 @@ def linearise(
     if not pieces:
         return None
     sigmas = np.array(list(smoother.settings.coefficients.values()))
-    return _side_by_side(pieces, np.array(numbers), torch.from_numpy(sigmas))
+    return _side_by_side(pieces, np.array(numbers), sigmas)
 
 
 def _piece(smoother: Smoother, track: Track) -> _Piece:
@@ -192,7 +198,7 @@ PADDED: Final = {
 """Fields with a row for each sample or interval, and what fills those of shorter tracks."""
 
 
-def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: Tensor) -> LinearTracks:
+def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: Array) -> LinearTracks:
     longest = max(len(piece["times"]) for piece in pieces)
 
     def padded(piece: _Piece, name: str) -> Array:
@@ -202,5 +208,5 @@ def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: 
         filling = array[-1:] if PADDED[name] == "edge" else np.zeros_like(array[:1])
         return np.concatenate((array, np.repeat(filling, longest - len(piece["times"]), axis=0)))
 
-    tensors = {name: torch.from_numpy(np.stack([padded(piece, name) for piece in pieces])) for name in pieces[0]}
-    return LinearTracks(numbers=numbers, coefficient_sigmas=coefficient_sigmas, **tensors)
+    fields = {name: np.stack([padded(piece, name) for piece in pieces]) for name in pieces[0]}
+    return LinearTracks(numbers=numbers, coefficient_sigmas=coefficient_sigmas, **fields)

@@ -7,9 +7,8 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.deferred import torch
 from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
-from ballfg.estimation.noise.parameters import Parameter, tensors_of
+from ballfg.estimation.noise.parameters import Parameter, by_logs, noise_of
 from ballfg.estimation.settings import Settings
 
 DIFFERENCE: Final = 0.002
@@ -67,14 +66,13 @@ class MarginalFit:
 
     def at(self, logs: Array) -> tuple[Array, Array]:
         """(t,) losses of the tracks at some logarithms, and (t, k) their derivatives."""
-        rows = torch.tensor(np.tile(logs, (self.tracks.count, 1)), dtype=torch.float64, requires_grad=True)
-        losses = self.tracks.losses(tensors_of(self.parameters, rows, self.settings))
-        (gradients,) = torch.autograd.grad(losses.sum(), rows)
-        return losses.detach().numpy(), gradients.numpy()
+        noise = noise_of(self.parameters, logs[None], self.settings)
+        losses, slopes = self.tracks.losses(noise)
+        return losses, by_logs(self.parameters, noise, slopes)
 
     def noise(self) -> Noise:
-        """The estimated noise, one row for each track."""
-        return tensors_of(self.parameters, torch.from_numpy(np.tile(self.logs, (self.tracks.count, 1))), self.settings)
+        """The estimated noise, one row for all tracks."""
+        return noise_of(self.parameters, self.logs[None], self.settings)
 
     def covariance(self) -> Array:
         """(k, k) of the logarithms, from the scatter of the tracks' gradients (the sandwich of P. J. Huber, 1967)."""
@@ -109,7 +107,7 @@ class MarginalFit:
             logs = begin + turn @ way
             try:
                 value, gradient = self._objective(*self.at(logs), logs)
-            except torch.linalg.LinAlgError:
+            except np.linalg.LinAlgError:
                 return worst + float(way @ way), 2.0 * way
             return value, turn.T @ gradient
 

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.deferred import torch
 from ballfg.estimation.measurement.position_noise import FACTOR_FOUR
 from ballfg.estimation.noise.linear_filter import Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import PROCESS_NOISE
 from ballfg.tracks.noise import TrackNoise
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -81,36 +77,55 @@ def parameters_of(
         label = settings.spin_label_noise if settings.launcher is None else settings.launcher.sigma
         unit = float(tracks.label_spreads[0])
         found.append(Parameter("spin_label", None, label, FACTOR_FOUR, 1.0 / unit, 300.0 / unit))
-    if not bool((tracks.labelled | ~tracks.group_sigmas.isnan().any(dim=1)).all()):
+    if not bool((tracks.labelled | ~np.isnan(tracks.group_sigmas).any(axis=1)).all()):
         found.append(Parameter("spin_prior", None, settings.spin_prior, FACTOR_FOUR, 3.0, 500.0))
     # each has its own multiple: short parts show how much drags differ, and nothing of bounces that are still to come
     found += [Parameter(COEFFICIENTS, place, 1.0, FACTOR_TWO, 0.03, 5.0) for place in range(len(settings.coefficients))]
     return found
 
 
-def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) -> Noise:
+def noise_of(parameters: list[Parameter], logs: Array, settings: Settings) -> Noise:
     """The noise for logarithms (r, k), with a row for each track or one for all.
 
     All other numbers are the settings'.
     """
-    values = {(p.name, p.axis): torch.exp(log) for p, log in zip(parameters, logs.unbind(-1), strict=True)}
+    values = {(p.name, p.axis): value for p, value in zip(parameters, np.exp(logs).T, strict=True)}
 
-    def one(name: str, otherwise: float, axis: int | None = None) -> Tensor:
-        return values.get((name, axis), torch.full((len(logs),), otherwise, dtype=torch.float64))
+    def one(name: str, otherwise: float, axis: int | None = None) -> Array:
+        return values.get((name, axis), np.full(len(logs), otherwise))
 
     white = settings.position_scale * np.array(settings.position_noise)
     process = [one(name, getattr(settings.process, name)) for name in PROCESS_NOISE]
-    places = [p.axis for p in parameters if p.name == COEFFICIENTS] or [None]
     return Noise(
-        position=torch.stack([one("position", white[a], a) / white[a] for a in range(3)], dim=-1),
-        memory=torch.stack([one("memory", settings.memory[a], a) for a in range(3)], dim=-1).square(),
+        position=np.stack([one("position", white[a], a) / white[a] for a in range(3)], axis=-1),
+        memory=np.stack([one("memory", settings.memory[a], a) for a in range(3)], axis=-1) ** 2,
         memory_time=one("memory_time", settings.memory_time),
-        stamp_jitter=one("stamp_jitter", settings.stamp_jitter).square(),
-        process=torch.stack(process, dim=-1),
+        stamp_jitter=one("stamp_jitter", settings.stamp_jitter) ** 2,
+        process=np.stack(process, axis=-1),
         spin_label=one("spin_label", settings.spin_label_noise),
         spin_prior=one("spin_prior", settings.spin_prior),
-        coefficients=torch.stack([one(COEFFICIENTS, 1.0, place) for place in places], dim=-1),
+        coefficients=np.stack([one(COEFFICIENTS, 1.0, place) for place in _places(parameters)], axis=-1),
     )
+
+
+def by_logs(parameters: list[Parameter], noise: Noise, slopes: Noise) -> Array:
+    """(t, k) derivatives by the logarithms of `noise_of`, from those by the noise (t, ...)."""
+    found, places = [], _places(parameters)
+    for p in parameters:
+        power, at = 2.0 if p.name in ("memory", "stamp_jitter") else 1.0, p.axis
+        name = p.name
+        if name in PROCESS_NOISE:
+            name, at = "process", PROCESS_NOISE.index(name)
+        elif name == COEFFICIENTS:
+            at = places.index(at)
+        value, slope = getattr(noise, name), getattr(slopes, name)
+        found.append(power * (value * slope if at is None else value[:, at] * slope[:, at]))
+    return np.stack(found, axis=1)
+
+
+def _places(parameters: list[Parameter]) -> list[int | None]:
+    """The places of the estimated coefficients; None for a multiple of all."""
+    return [p.axis for p in parameters if p.name == COEFFICIENTS] or [None]
 
 
 def track_noise(parameters: list[Parameter], logs: Array, settings: Settings) -> TrackNoise:

@@ -9,10 +9,10 @@ whole (docs/derivations/budget.md).
 from dataclasses import replace
 from typing import Final
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from ballfg.estimation.noise.linear_filter import BIAS_DIM, LinearFilter, Noise, Variances
+from ballfg.arrays import Array, Mask
+from ballfg.estimation.noise.linear_filter import BIAS_DIM, LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.factors.noise import PROCESS_NOISE
 from ballfg.state import POSITION, SPIN, STATE_DIM
@@ -25,8 +25,8 @@ IN_FLIGHT: Final = [PROCESS_NOISE.index(name) for name in ("acceleration", "spin
 
 
 def squares_by_source(
-    tracks: LinearTracks, noise: Noise, velocity_prior: float, observed: Tensor, predicted: Tensor
-) -> Tensor:
+    tracks: LinearTracks, noise: Noise, velocity_prior: float, observed: Mask, predicted: Mask
+) -> Array:
     """Expected squared distances of predicted from measured positions, by source.
 
     A prediction is the ball's position, as `predict_tracks` makes it: the tracker's lasting error is not carried on.
@@ -37,43 +37,42 @@ def squares_by_source(
         velocity_prior: m/s, standard deviation per axis at the start of a track.
         observed, predicted: (t, n) bool, samples that a prediction knows, and those it is compared with.
     Returns: (t, 7) m^2, summed over the predicted samples, in the order of `SOURCES`.
-    Raises: torch.linalg.LinAlgError: the covariance of an innovation is not positive definite.
+    Raises: numpy.linalg.LinAlgError: the covariance of an innovation is not positive definite.
     """
     lasting = bool((noise.memory > 0.0).any())
     known = replace(tracks, used=tracks.used & observed)
     linear = LinearFilter(known, velocity_prior, biased=lasting)
     white, measured = linear.white(noise), linear.measured(noise)
-    stamps = measured - torch.diag_embed(white)
-    given = linear.variances(noise, measured)
-    sources = [x.detach().clone().requires_grad_() for x in (given.process, given.memory, given.prior, white, stamps)]
-    process, memory, prior, own, jitter = sources
-    variances = Variances(process, memory, prior, torch.diag_embed(own) + jitter)
-    covariances = linear.run_with(variances, noise.memory_time).covariances
-    squares = (_trace(covariances[..., POSITION, POSITION]) * predicted).sum()
-    slopes = torch.autograd.grad(squares, sources, allow_unused=True)
-    process, memory, prior, own, jitter = (
-        source.detach() * (torch.zeros_like(source) if slope is None else slope)
-        for source, slope in zip(sources, slopes, strict=True)
-    )
-    later = _trace(stamps) + given.memory.sum(dim=1)[:, None]
+    stamps = measured.copy()
+    for axis in range(3):
+        stamps[..., axis, axis] -= white[..., axis]
+    filtered = linear.run(noise, measured)
+    given, covariances = filtered.variances, filtered.covariances
+    by_covariances = np.zeros_like(covariances)
+    for axis in range(3):
+        by_covariances[..., axis, axis] = predicted
+    by, _ = linear.slopes(filtered, by_states=(np.zeros_like(filtered.means), by_covariances))
+    process, memory, prior = (getattr(given, n) * getattr(by, n) for n in ("process", "memory", "prior"))
+    own, jitter = white * np.diagonal(by.measured, axis1=2, axis2=3), stamps * by.measured
+    later = _trace(stamps) + given.memory.sum(axis=1)[:, None]
     if lasting:  # an error that lasts through the end of the observed part is in the prediction and in the sample
         bias = slice(linear.own, linear.own + BIAS_DIM)
-        later = later + 2.0 * _trace(covariances[..., POSITION, bias].detach())
-    in_flight = process[:, IN_FLIGHT].sum(dim=1)
-    return torch.stack(
+        later = later + 2.0 * _trace(covariances[..., POSITION, bias])
+    in_flight = process[:, IN_FLIGHT].sum(axis=1)
+    return np.stack(
         [
-            own.sum(dim=(1, 2)) + prior[:, : SPIN.start].sum(dim=1),
-            prior[:, SPIN].sum(dim=1),
-            prior[:, STATE_DIM:].sum(dim=1),
-            jitter.sum(dim=(1, 2, 3)) + memory.sum(dim=1) + (later * predicted).sum(dim=1),
-            process.sum(dim=1) - in_flight,
+            own.sum(axis=(1, 2)) + prior[:, : SPIN.start].sum(axis=1),
+            prior[:, SPIN].sum(axis=1),
+            prior[:, STATE_DIM:].sum(axis=1),
+            jitter.sum(axis=(1, 2, 3)) + memory.sum(axis=1) + (later * predicted).sum(axis=1),
+            process.sum(axis=1) - in_flight,
             in_flight,
-            (white.sum(dim=-1) * predicted).sum(dim=1),
+            (white.sum(axis=-1) * predicted).sum(axis=1),
         ],
-        dim=1,
+        axis=1,
     )
 
 
-def _trace(matrices: Tensor) -> Tensor:
+def _trace(matrices: Array) -> Array:
     """(...) of matrices (..., 3, 3)."""
-    return torch.diagonal(matrices, dim1=-2, dim2=-1).sum(dim=-1)
+    return np.trace(matrices, axis1=-2, axis2=-1)

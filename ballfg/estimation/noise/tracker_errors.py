@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array, Mask
 from ballfg.estimation.noise.linear_filter import LinearFilter
@@ -165,14 +164,12 @@ def _cleared(scores: Array, others: Array) -> Array:
 def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Array:
     """(t,) derivative of each track's log likelihood by the variance of a part, at zero variance."""
     noise = fit.noise()
-    variance = torch.zeros(fit.tracks.count, dtype=torch.float64, requires_grad=True)
-    if name == MEMORY:
-        white = noise.position.mean() * torch.tensor(fit.settings.position_noise).square()
-        noise = replace(noise, memory=variance[:, None] * white, memory_time=torch.full_like(variance, time).detach())
-    else:
-        noise = replace(noise, stamp_jitter=variance * JITTER_UNIT**2)
-    (gradient,) = torch.autograd.grad(tracks.losses(noise).sum(), variance)
-    return np.asarray(-gradient.numpy())
+    if name != MEMORY:
+        _, slopes = tracks.losses(replace(noise, stamp_jitter=np.zeros(1)))
+        return -(JITTER_UNIT**2) * slopes.stamp_jitter
+    white = noise.position.mean() * np.square(fit.settings.position_noise)
+    _, slopes = tracks.losses(replace(noise, memory=np.zeros((1, 3)), memory_time=np.array([time])))
+    return -slopes.memory @ white
 
 
 def _p_value(score: Array, freedom: float) -> float:

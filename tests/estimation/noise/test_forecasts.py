@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from ballfg.estimation import Smoother, predict_tracks
 from ballfg.estimation.noise.estimate import _Search
 from ballfg.estimation.noise.forecasts import HORIZONS, Forecaster
 from ballfg.estimation.noise.linear_tracks import linearise
-from ballfg.estimation.noise.parameters import parameters_of, tensors_of
+from ballfg.estimation.noise.parameters import by_logs, noise_of, parameters_of
 from ballfg.factors.noise import PROCESS_NOISE
 from ballfg.simulation import MeasurementNoise
 from ballfg.state import POSITION, STATE_DIM
@@ -26,15 +25,15 @@ def case(recorded):
     return model, surfaces, settings, tracks, linear, Forecaster(linear, settings.velocity_prior)
 
 
-def noise_of(settings, linear, shift=0.0):
+def shifted_noise(settings, linear, shift=0.0):
     parameters = parameters_of(settings, linear, position_known=False)
-    return tensors_of(parameters, torch.tensor([np.log(p.start) + shift for p in parameters])[None], settings)
+    return noise_of(parameters, np.array([[np.log(p.start) + shift for p in parameters]]), settings)
 
 
 def test_noise_without_parameters_is_the_settings(case):
     """And a first spread of coefficients that is once theirs."""
     *_, settings, _, _, _ = case
-    noise = tensors_of([], torch.zeros((1, 0), dtype=torch.float64), settings)
+    noise = noise_of([], np.zeros((1, 0)), settings)
     assert noise.coefficients.item() == 1.0
     assert noise.position.tolist() == [[1.0, 1.0, 1.0]]
     assert noise.spin_label.item() == settings.spin_label_noise
@@ -51,36 +50,36 @@ def test_forecasts_start_a_fifth_of_a_second_after_the_first_sample(case):
 def dense(linear, forecaster, noise, track):
     """Mean (3 n,) and covariance of all measured positions of a track, as deviations, from the joint Gaussian."""
     n, own, width = linear.times.shape[1], forecaster.filter.own, forecaster.filter.width
-    transitions, gathered = (x[track].numpy() for x in in_torch.motion(forecaster.filter, noise))
-    prior = linear.prior_variances(
-        noise.spin_prior, noise.spin_label, noise.coefficients, forecaster.filter.velocity_prior
+    given = forecaster.filter, in_torch.leaves(noise)
+    transitions, gathered, prior = (
+        x[track].detach().numpy() for x in (*in_torch.motion(*given), in_torch.prior(*given))
     )
     mean, cov = np.zeros(n * width), np.zeros((n * width, n * width))
     mean[:own] = linear.starts[track]
-    cov[:width, :width] = np.diag(np.concatenate((prior[track].numpy(), noise.memory[0].numpy())))
+    cov[:width, :width] = np.diag(np.concatenate((prior, noise.memory[0])))
     for k in range(1, n):
         now, last = slice(k * width, (k + 1) * width), slice((k - 1) * width, k * width)
         step = transitions[k - 1]
         mean[now] = step @ mean[last]
-        mean[k * width : k * width + own] += linear.offsets[track, k - 1].numpy()
+        mean[k * width : k * width + own] += linear.offsets[track, k - 1]
         cov[now, : k * width] = step @ cov[last, : k * width]
         cov[: k * width, now] = cov[now, : k * width].T
         cov[now, now] = step @ cov[last, last] @ step.T + gathered[k - 1]
     observe = np.kron(np.eye(n), in_torch.measure(forecaster.filter).numpy())
     spread = observe @ cov @ observe.T
     for k in range(n):
-        spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += forecaster.filter.measured(noise)[track, k].numpy()
+        spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += forecaster.filter.measured(noise)[track, k]
     return observe @ mean, spread
 
 
 def test_score_is_that_of_the_joint_gaussian(case):
     *_, settings, _, linear, forecaster = case
-    noise = noise_of(settings, linear)
+    noise = shifted_noise(settings, linear)
     total, count = 0.0, 0
     horizons = np.array(HORIZONS)
     for track in range(len(linear)):
         mean, cov = dense(linear, forecaster, noise, track)
-        times, used, errors = (x[track].numpy() for x in (linear.times, linear.used, linear.errors))
+        times, used, errors = (x[track] for x in (linear.times, linear.used, linear.errors))
         for start in forecaster.starts[forecaster.starts[:, 0] == track, 1].tolist():
             seen = np.flatnonzero(np.repeat(used[: start + 1], 3))
             ahead = {
@@ -98,46 +97,44 @@ def test_score_is_that_of_the_joint_gaussian(case):
                 total, count = total + float((loss + 0.5 * np.log(left[rows])).sum()), count + 1
     measured = forecaster.filter.measured(noise)
     filtered = forecaster.filter.run(noise, measured)
-    own, _, scored = forecaster._forecast(filtered, noise, measured)
-    assert scored == count
-    np.testing.assert_allclose(float(own.sum()) / scored, total / count, rtol=1e-6)
+    own = forecaster._look(filtered, noise, measured).scores
+    assert len(own) == count
+    np.testing.assert_allclose(own.mean(), total / count, rtol=1e-6)
 
 
 def test_gradient_is_that_of_differences(case):
     *_, settings, _, linear, forecaster = case
     parameters = parameters_of(settings, linear, position_known=False)
-    logs = torch.tensor([np.log(p.start) for p in parameters], requires_grad=True)
-    (gradient,) = torch.autograd.grad(forecaster.score(tensors_of(parameters, logs[None], settings)).value, logs)
+    logs = np.log([[p.start for p in parameters]])
+    noise = noise_of(parameters, logs, settings)
+    gradient = by_logs(parameters, noise, forecaster.score(noise).slopes).sum(axis=0)
     for k in range(len(parameters)):
-        step = torch.zeros(len(parameters), dtype=torch.float64)
+        step = np.zeros(len(parameters))
         step[k] = 1e-5
-        up, down = (
-            float(forecaster.score(tensors_of(parameters, (logs.detach() + s * step)[None], settings)).value)
-            for s in (1, -1)
-        )
+        up, down = (forecaster.score(noise_of(parameters, logs + s * step, settings)).value for s in (1, -1))
         assert float(gradient[k]) == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-8)
 
 
 def test_forecast_has_the_sigmas_of_a_prediction(case):
     """What the linear filter says 0.2 s ahead, the smoother of the seen part and the propagator say too."""
     model, surfaces, settings, tracks, linear, forecaster = case
-    noise = noise_of(settings, linear)
+    noise = shifted_noise(settings, linear)
     parameters = parameters_of(settings, linear, position_known=False)
     own = replace(
         settings,
-        memory=tuple(noise.memory[0].sqrt().tolist()),
-        memory_time=float(noise.memory_time),
-        stamp_jitter=float(noise.stamp_jitter.sqrt()),
+        memory=tuple(np.sqrt(noise.memory[0]).tolist()),
+        memory_time=float(noise.memory_time[0]),
+        stamp_jitter=float(np.sqrt(noise.stamp_jitter[0])),
         find_events=False,
     )
     assert {p.name for p in parameters} >= {"position", "memory", "acceleration"}
-    transitions, gathered = in_torch.motion(forecaster.filter, noise)
+    transitions, gathered = (x.detach().numpy() for x in in_torch.motion(forecaster.filter, in_torch.leaves(noise)))
     measured = forecaster.filter.measured(noise)
-    observe = in_torch.measure(forecaster.filter)
+    observe = in_torch.measure(forecaster.filter).numpy()
     covariances = forecaster.filter.run(noise, measured).covariances
     for track in range(len(tracks)):
-        start = int(np.searchsorted(linear.times[track].numpy(), 0.25))
-        end = int(np.searchsorted(linear.times[track].numpy(), 0.35))
+        start = int(np.searchsorted(linear.times[track], 0.25))
+        end = int(np.searchsorted(linear.times[track], 0.35))
         covariance = covariances[track, start]
         for k in range(start, end):
             covariance = transitions[track, k] @ covariance @ transitions[track, k].T + gathered[track, k]
@@ -146,16 +143,16 @@ def test_forecast_has_the_sigmas_of_a_prediction(case):
         (prediction,) = predict_tracks(Smoother(model, surfaces, own), [tracks[track]], 1, seen)
         if prediction.estimate.contacts:
             continue  # the seen part moves its contact; the linear filter keeps that of the whole track
-        np.testing.assert_allclose(spread.diagonal().sqrt().numpy(), prediction.sigmas[end - start - 1], rtol=0.06)
+        np.testing.assert_allclose(np.sqrt(spread.diagonal()), prediction.sigmas[end - start - 1], rtol=0.06)
 
 
 def test_linear_tracks_follow_the_smoother(case):
     *_, tracks, linear, _ = case
     assert len(linear) == len(tracks)
     assert linear.transitions.shape[-1] == STATE_DIM + len(linear.coefficient_sigmas)
-    assert float(linear.errors.abs()[linear.used].max()) < 0.02
-    steps = linear.transitions[:, :, POSITION, POSITION].diagonal(dim1=-2, dim2=-1)
-    assert float((steps[..., :2] - 1.0).abs().max()) < 0.01  # a bounce turns z alone
+    assert np.abs(linear.errors[linear.used]).max() < 0.02
+    steps = np.diagonal(linear.transitions[:, :, POSITION, POSITION], axis1=-2, axis2=-1)
+    assert np.abs(steps[..., :2] - 1.0).max() < 0.01  # a bounce turns z alone
 
 
 def test_what_is_known_of_a_start_is_told_as_a_deviation_from_the_estimate(case):
@@ -163,7 +160,7 @@ def test_what_is_known_of_a_start_is_told_as_a_deviation_from_the_estimate(case)
     model, surfaces, settings, tracks, linear, _ = case
     smoother = Smoother(model, surfaces, replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0))
     usual = [float(dict(model.named_parameters())[name].detach()) for name in settings.coefficients]
-    for own, track in zip(linear.starts.numpy(), tracks, strict=True):
+    for own, track in zip(linear.starts, tracks, strict=True):
         estimate = smoother.estimate(track)
         assert 0 not in estimate.hits
         spin = np.zeros(3) if track.spin_label is None else track.spin_label
@@ -190,8 +187,10 @@ def test_curvature_and_scatter_behind_the_error_bars(case):
     profile, inverse = search.profile(logs), np.linalg.inv(hessian)
     assert search.names == ["memory.z", "acceleration"]
     np.testing.assert_allclose(profile._inverse(logs), inverse, rtol=0.02)
-    rows = torch.tensor(np.tile(logs, (forecaster.count, 1)), requires_grad=True)
-    scores = forecaster.score(tensors_of(search.parameters, rows, settings)).by_track
-    own = [torch.autograd.grad(score, rows, retain_graph=True)[0].sum(dim=0).numpy() for score in scores]
-    scatter = np.cov(np.array(own).T) * len(own) * search.weight**2
-    np.testing.assert_allclose(search._scatter(logs), scatter, rtol=1e-6)
+    moves = [[logs + s * 1e-5 * move for s in (1, -1)] for move in np.eye(len(logs))]
+    by_track = [
+        [forecaster.score(noise_of(search.parameters, end[None], settings)).by_track for end in ends] for ends in moves
+    ]
+    own = np.array([(up - down) / 2e-5 for up, down in by_track]).T
+    scatter = np.cov(own.T) * len(own) * search.weight**2
+    np.testing.assert_allclose(search._scatter(logs), scatter, rtol=1e-5)
