@@ -204,12 +204,14 @@ def test_estimates_of_a_fresh_process_need_no_torch(of_file: bool, tmp_path: Pat
     assert (said[0][1:], said[1][1:]) == (["True", "True"], ["False", "True"])
 
 
-def test_commands_on_a_dataset_need_no_torch(tmp_path: Path) -> None:
-    """Of one track, which does not show its noise; the model file beside the tracks is the usual one."""
+@pytest.mark.parametrize("count", [1, 6])
+def test_commands_on_a_dataset_need_no_torch(count: int, tmp_path: Path) -> None:
+    """Of one track, which does not show its noise, and of some that do; the model beside them is the usual one."""
     times = np.arange(50) / 100.0
     path = np.stack([4.0 * times, 0.1 + 0.0 * times, 0.3 + 1.5 * times - 4.7 * times**2], axis=1)
-    path += 0.002 * np.random.default_rng(0).normal(size=path.shape)
-    write_dataset(tmp_path / "shots", DatasetInfo("shots", None, TABLE_TENNIS), [Track(times, path, name="one")])
+    rng = np.random.default_rng(0)
+    tracks = [Track(times, path + 0.002 * rng.normal(size=path.shape), name=f"{k}") for k in range(count)]
+    write_dataset(tmp_path / "shots", DatasetInfo("shots", None, TABLE_TENNIS), tracks)
     save_model(nominal_model(), tmp_path / "shots" / "model.yaml")
     keep_nominal(TABLE_TENNIS)
     for words in (
