@@ -44,7 +44,8 @@ def compile_ahead(
     for known in KNOWN_BALLS.values():
         keep_nominal(known.ball)
     for path, one in files.items():
-        keep(about_file(path, None, inertia), one)
+        for radius in (None, one.radius):  # as arrays ask for it, and as a dataset of that ball does
+            keep(about_file(path, radius, inertia), one)
     parts = [part for one in models.values() for part in _parts(one)]
     parts.append(partial(_search, models["table_tennis"]))  # its code is the same for all balls
     for part in progress(parts, len(parts), "parts compiled"):

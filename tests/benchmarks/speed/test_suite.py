@@ -73,6 +73,7 @@ def test_an_analytic_model_has_its_times() -> None:
 
 
 @pytest.mark.thorough
+@pytest.mark.filterwarnings("ignore:budget_ms is:UserWarning")  # a busy machine may be too slow for the budget
 def test_speed_run_has_every_time() -> None:
     results = Results("test", 0)
     run_speed(results, None, replace(QUICK, runs=2, warm_up=1, fit_iterations=100, pretrain_iterations=10, flights=1))
