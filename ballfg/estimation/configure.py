@@ -6,7 +6,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
+from ballfg.parallel.parts import jobs_here
 from ballfg.progress import Watch, doing, unwatched
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Dataset, Track
@@ -200,7 +201,8 @@ def tracks_settings(
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
     outside = _share_outside(model, surfaces, plain, parts)
     begun = plain if outside is None else with_usual_noise(plain, model, outside)
-    found = estimate_noise(model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch)
+    how: dict[str, Any] = {"position_known": position_known, "errors": False, "watch": watch, "jobs": jobs_here()}
+    found = estimate_noise(model, surfaces, begun, parts, **how)
     if found is None or outside is None:
         return None if found is None else found.settings
     known, shown = settings.process.acceleration, found.settings.process.acceleration
