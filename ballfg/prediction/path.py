@@ -101,7 +101,8 @@ class Path:
         if not (apart or self._near_a_bounce(found)):
             return found, None
         soon = math.ceil((found.time - self.start.time + 2.0 * FAR * found.time_sigma) / STEP) * STEP
-        balls = self if apart or soon >= self.horizon else Path(self.start, self.carried, soon)  # all have it by then
+        whole = apart or soon >= self.horizon or self._just_now(Line.of(APEX))  # which needs the whole path anyway
+        balls = self if whole else Path(self.start, self.carried, soon)  # all have it by then
         times, states, met = balls._events(line)
         if len(met) and (apart or (met != met[0]).any()):
             found = spread_over(found, states, times - (found.time - self.start.time))
