@@ -102,8 +102,10 @@ class Path:
             return found, None
         soon = math.ceil((found.time - self.start.time + 2.0 * FAR * found.time_sigma) / STEP) * STEP
         whole = apart or soon >= self.horizon or self._just_now(Line.of(APEX))  # which needs the whole path anyway
-        balls = self if whole else Path(self.start, self.carried, soon)  # all have it by then
+        balls = self if whole else Path(self.start, self.carried, soon)
         times, states, met = balls._events(line)
+        if len(met) < len(balls.possible.states) and not whole:  # some are much slower than the mean
+            balls, (times, states, met) = self, self._events(line)
         if len(met) and (apart or (met != met[0]).any()):
             found = spread_over(found, states, times - (found.time - self.start.time))
         return found, balls

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,5 +208,5 @@ def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: 
         filling = array[-1:] if PADDED[name] == "edge" else np.zeros_like(array[:1])
         return np.concatenate((array, np.repeat(filling, longest - len(piece["times"]), axis=0)))
 
-    fields = {name: np.stack([padded(piece, name) for piece in pieces]) for name in pieces[0]}
+    fields: dict[str, Any] = {name: np.stack([padded(piece, name) for piece in pieces]) for name in pieces[0]}
     return LinearTracks(numbers=numbers, coefficient_sigmas=coefficient_sigmas, **fields)
