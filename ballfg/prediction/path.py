@@ -100,7 +100,8 @@ class Path:
         apart = self._apart(found, line)
         if not (apart or self._near_a_bounce(found)):
             return found, None
-        soon = math.ceil((found.time - self.start.time + 2.0 * FAR * found.time_sigma) / STEP) * STEP
+        soon = min(self.horizon, found.time - self.start.time + 2.0 * FAR * found.time_sigma)  # which may be infinite
+        soon = math.ceil(soon / STEP) * STEP
         whole = apart or soon >= self.horizon or self._just_now(Line.of(APEX))  # which needs the whole path anyway
         balls = self if whole else Path(self.start, self.carried, soon)
         times, states, met = balls._events(line)

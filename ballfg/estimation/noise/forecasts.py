@@ -144,12 +144,13 @@ class Forecaster:
         for axis in range(3):
             np.add.at(by.measured[..., axis, axis], ends, by_variance[:, axis])
         np.add.at(by.process, ahead.track, np.einsum("sa,saq->sq", by_variance, ahead.kicks))
-        if not self.filter.biases:
-            return self.filter.noise_slopes(noise, filtered, by, by_decays)
         decay, memory = looked.decay, filtered.variances.memory[ahead.track]
-        np.add.at(by.memory, ahead.track, by_variance * (1.0 - decay**2)[:, None])
-        late = share * looked.by_decay - 2.0 * decay * (by_variance * memory).sum(axis=1)
+        if self.filter.biases:
+            np.add.at(by.memory, ahead.track, by_variance * (1.0 - decay**2)[:, None])
         found = self.filter.noise_slopes(noise, filtered, by, by_decays)
+        if not self.filter.biases:
+            return found
+        late = share * looked.by_decay - 2.0 * decay * (by_variance * memory).sum(axis=1)
         through = np.bincount(ahead.track, late * decay * ahead.elapsed, self.count) / noise.memory_time**2
         return replace(found, memory_time=found.memory_time + through)
 
