@@ -35,11 +35,10 @@ def event_on(path: Path, asked: Plane | str) -> EventAhead:
     if asked == CONTACT:
         return EventAhead(*contact_ahead(path))
     line = Line.of(asked)
-    found, balls = path.event(line)
-    if line.after > 0 and path.start.other_side is not None:  # balls have bounced just now, or have not
-        balls = path
-    if balls is not None:
-        return EventAhead(found, _chance_of(balls, line))
+    found, alike = path.event(line)
+    torn = line.after > 0 and path.start.other_side is not None  # balls have bounced just now, or have not
+    if torn or not alike:
+        return EventAhead(found, _chance_of(path, line))
     return EventAhead(found, 0.0 if found is None else _sooner(found, path.start.time + path.horizon - found.time))
 
 

@@ -80,36 +80,40 @@ class Path:
         """The next highest point of the mean ball, with the covariance of all balls about it that have one."""
         return self.event(Line.of(APEX))[0]
 
-    def event(self, line: Line) -> tuple[Crossing | None, Path | None]:
-        """The mean ball's event with the covariance of all balls about it that have one.
+    def event(self, line: Line) -> tuple[Crossing | None, bool]:
+        """The mean ball's event with the covariance of all balls about it that have one, and whether all are alike.
 
-        It also returns the path whose possible balls tell how probable it is; None where all balls are alike: none has
-        it, or all have it as the mean's neighbours do, sooner or later, near its place. Near a bounce some have it
-        before and others after; some have had it just now, and have it again later or in the other direction; by an end
-        of the table some meet the table and others do not; some turn before a plane.
+        Alike, none has it, or all have it and only its time is in doubt. Near a bounce some have it before and others
+        after; some have had it just now, and have it again later or in the other direction; by an end of the table some
+        meet the table and others do not; some turn before a plane.
         """
         since = -math.inf
         for _ in range(line.after):
             contact = self.contact(since)
             if contact is None:
-                return None, self
+                return None, False
             since = contact.time
         found = line_crossing(*self.searched, line, self.horizon, since)
         if found is None:
-            return None, None if self._stays_off(line) else self
+            return None, self._stays_off(line)
         apart = self._apart(found, line)
         if not (apart or self._near_a_bounce(found)):
-            return found, None
-        soon = min(self.horizon, found.time - self.start.time + 2.0 * FAR * found.time_sigma)  # which may be infinite
-        soon = math.ceil(soon / STEP) * STEP
-        whole = apart or soon >= self.horizon or self._just_now(Line.of(APEX))  # which needs the whole path anyway
-        balls = self if whole else Path(self.start, self.carried, soon)
-        times, states, met = balls._events(line)
-        if len(met) < len(balls.possible.states) and not whole:  # some are much slower than the mean
-            balls, (times, states, met) = self, self._events(line)
+            return found, True
+        alike, events = (False, self._events(line)) if apart else self._soon(found, line)
+        times, states, met = events
         if len(met) and (apart or (met != met[0]).any()):
             found = spread_over(found, states, times - (found.time - self.start.time))
-        return found, balls
+        return found, alike
+
+    def _soon(self, found: Crossing, line: Line) -> tuple[bool, tuple[Array, Array, Array]]:
+        """`_events` near a bounce, and whether all balls have one soon: they need not be followed any further then."""
+        soon = min(self.horizon, found.time - self.start.time + 2.0 * FAR * found.time_sigma)  # which may be infinite
+        soon = math.ceil(soon / STEP) * STEP
+        if soon < self.horizon and not self._just_now(Line.of(APEX)):  # which needs the whole way anyway
+            events = (way := Path(self.start, self.carried, soon))._events(line)
+            if len(events[0]) == len(way.possible.states):  # none is much slower than the mean
+                return True, events
+        return False, self._events(line)
 
     def _stays_off(self, line: Line) -> bool:
         """Whether all balls stay on the mean's side of a plane, which it does not cross within the horizon."""

@@ -6,6 +6,7 @@ import pytest
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import BallState
+from ballfg.prediction.event_ahead import event_on
 from ballfg.prediction.forecast import carried_by
 from ballfg.prediction.path import Path
 from ballfg.prediction.plane import Line, Plane
@@ -34,8 +35,8 @@ def test_no_possible_ball_crosses_a_plane_that_all_stay_off(surfaces: Surfaces) 
         direction = ("either", "up", "down")[rng.integers(3)]
         line = Line.of(Plane(tuple(normal.tolist()), place, direction, int(rng.integers(3))))
         path = Path(state, carried_by(state), float(rng.uniform(0.2, 1.5)))
-        found, balls = path.event(line)
-        if found is None and balls is None:
+        found, alike = path.event(line)
+        if found is None and alike:
             off += 1
             assert path.probability(line) == 0.0
     assert off > 15
@@ -48,17 +49,15 @@ def test_near_a_bounce_a_short_way_tells_what_the_whole_one_does() -> None:
         axis = int(rng.integers(2))
         along = (float(axis == 0), float(axis == 1), 0.0)
         place = float(state.state[axis] + rng.uniform(0.1, 0.8) * state.state[3 + axis])
-        line, way = Line.of(Plane(along, place)), carried_by(state)
-        found, balls = Path(state, way, 1.5).event(line)
-        if found is None or balls is None or balls.horizon == 1.5:
+        line, whole = Line.of(Plane(along, place)), Path(state, carried_by(state), 1.5)
+        found, alike = whole.event(line)
+        times, places, met = whole._events(line)
+        if found is None or not alike or not (met != met[0]).any():
             continue
-        short, whole = short + 1, Path(state, way, 1.5)
-        assert balls.probability(line) == whole.probability(line) == 1.0
-        times, places, _ = whole._events(line)
-        met = balls._events(line)[2]
-        if (met != met[0]).any():
-            late = np.sqrt(((times - found.time) ** 2).mean())
-            assert found.time_sigma == pytest.approx(late, rel=0.05)
-            wide = np.sqrt(((places[:, :3] - found.state[:3]) ** 2).mean(axis=0))
-            np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance)[:3]), wide, rtol=0.05, atol=1e-9)
+        short += 1
+        assert whole.probability(line) == event_on(whole, Plane(along, place)).probability == 1.0
+        late = np.sqrt(((times - found.time) ** 2).mean())
+        assert found.time_sigma == pytest.approx(late, rel=0.05)
+        wide = np.sqrt(((places[:, :3] - found.state[:3]) ** 2).mean(axis=0))
+        np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance)[:3]), wide, rtol=0.05, atol=1e-9)
     assert short > 15
