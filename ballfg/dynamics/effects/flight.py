@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, Range, Scene, Usual, length, vector
 from ballfg.state import STANDARD_GRAVITY, Z
+from ballfg.tracks.checks import MAX_COORDINATE
 
 TINY_SPEED: Final = 1e-9
 """m/s. Keeps 0/0 away for a ball that neither moves nor spins; its saturated lift is zero anyway."""
@@ -132,7 +133,7 @@ class WindShear(FlightEffect):
     decide = "Shoot at different heights in one direction, or hold a thread at two heights."
     coefficients = (
         *(Coefficient(axis, 0.0, 0.3, "1/s", -20.0, 20.0) for axis in "xy"),
-        Coefficient("reference", 1.0, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("reference", 1.0, 0.5, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
     )
     plausible = Range(-1.0, 1.0, "a draught of 0.5 m/s in the lower half metre of a room and still air above it")
     usual = Usual({"x": 0.5}, "an estimate: half of the strongest that is plausible")
@@ -161,9 +162,9 @@ class GustRegion(FlightEffect):
     decide = "Shoot past the suspected place on both sides: the wind is everywhere, the gust in one place."
     coefficients = (
         *(Coefficient(axis, 0.0, 0.5, "m/s", -20.0, 20.0) for axis in "xyz"),
-        Coefficient("center_x", 1.4, 1.0, "m", -100.0, 100.0, absent=None),
-        Coefficient("center_y", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
-        Coefficient("center_z", 1.1, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("center_x", 1.4, 1.0, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
+        Coefficient("center_y", 0.0, 0.5, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
+        Coefficient("center_z", 1.1, 0.5, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
         Coefficient("size", 0.4, 0.2, "m", 0.01, 100.0, absent=None),
     )
     plausible = Range(

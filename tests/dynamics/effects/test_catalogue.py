@@ -8,8 +8,10 @@ import torch
 
 from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.effect import Coefficient, FlightEffect
+from ballfg.dynamics.effects.registry import GENERIC
 from ballfg.dynamics.model import substitute, take_rows
 from ballfg.dynamics.motion.integrate import fly
+from ballfg.tracks.checks import MAX_COORDINATE
 
 BASE = {
     "gravity": {"g": 9.8},
@@ -265,3 +267,12 @@ def test_another_time_scale_is_another_g_and_magnus_coefficient():
     start = STATE * torch.tensor([1.0] * 3 + [1 / (1 + s)] * 3 + [1.0] * 3, dtype=torch.float64)
     seen, true = fly(slow, start, stamp), fly(model_with(), STATE, TIMES[0])
     torch.testing.assert_close(seen[:, :3], true[:, :3], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("effect", [*EFFECTS.values(), *GENERIC.values()])
+def test_a_place_may_lie_wherever_a_track_may(effect):
+    """A diagnosis puts it in the middle of the data, and a golf ball lands 200 m away."""
+    for c in effect.coefficients:
+        if c.absent is None and c.unit == "m" and c.low < 0.0:
+            assert c.low == -MAX_COORDINATE
+            assert c.high == MAX_COORDINATE
