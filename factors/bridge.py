@@ -93,9 +93,8 @@ class Bridge:
         Returns: residuals (k, r) and Jacobians (k, r, d), whitened, as cached.
         Raises: ValueError: if the batch returns a wrong shape, another type than float64 or a value that is not finite.
         """
-        inputs = tuple(
-            np.array(block, dtype=np.float64, order="C") for block in inputs
-        )  # the caller may change its own
+        own = [np.array(block, dtype=np.float64, order="C") for block in inputs]  # the caller may change its own
+        inputs = tuple(own)
         self.calls += 1
         residual, jacobians = checked(self.batch, rows, inputs, *self.batch.compute(rows, inputs))
         for k, row in enumerate(rows.tolist()):

@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from ballfg.dynamics.model import BallModel
 
+DOUBT: Final = "fading."  # Prefix of the names of what a `LearnedModel` doubts in its correction
 THIN_SHELL: Final = 2.0 / 3.0  # Moment of inertia of a thin spherical shell divided by m R^2
 _OF_BOUNCE: Final = re.compile(r"^((?:model\.|base\.)*)contact\.")
-
-
-DOUBT: Final = "fading."  # Prefix of the names of what a `LearnedModel` doubts in its correction
 
 
 @dataclass(frozen=True)

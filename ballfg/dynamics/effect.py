@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from ballfg.checks import as_float
 from ballfg.dynamics.coefficient import Coefficient as Coefficient
 from ballfg.state import POSITION, SPIN, VELOCITY
+from ballfg.tracks.checks import MAX_COORDINATE
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,11 @@ def length(vector: Tensor) -> Tensor:
 def vector(*coefficients: Tensor) -> Tensor:
     """(k,) or (..., k) vectors from k coefficients, each of shape () or (..., 1), all in one unit."""
     return torch.cat(torch.broadcast_tensors(*(c if c.dim() else c.unsqueeze(-1) for c in coefficients)), dim=-1)
+
+
+def coordinate(name: str, default: float, sigma: float) -> Coefficient:
+    """One coordinate of an effect's place, m: it may lie wherever a track may. Args: default, sigma: m."""
+    return Coefficient(name, default, sigma, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None)
 
 
 def per_row(value: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -201,8 +201,10 @@ def tracks_settings(
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
     outside = _share_outside(model, surfaces, plain, parts)
     begun = plain if outside is None else with_usual_noise(plain, model, outside)
-    how: dict[str, Any] = {"position_known": position_known, "errors": False, "watch": watch, "jobs": jobs_here()}
-    found = estimate_noise(model, surfaces, begun, parts, **how)
+    jobs = jobs_here()
+    found = estimate_noise(
+        model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch, jobs=jobs
+    )
     if found is None or outside is None:
         return None if found is None else found.settings
     known, shown = settings.process.acceleration, found.settings.process.acceleration

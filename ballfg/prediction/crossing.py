@@ -187,13 +187,11 @@ def _first(
     while now < end:
         if search is not None:
             found = search(belief, end - now, earliest - now)
+            now += found.elapsed
             if found.how == FOUND:
-                return _projected(
-                    start + (now + found.elapsed), found.mean, found.covariance, found.gradient, found.rate
-                )
+                return _projected(start + now, found.mean, found.covariance, found.gradient, found.rate)
             if found.how == NONE:
                 return None
-            now += found.elapsed
             belief = Belief(belief.model, np.array([now]), found.mean[None], found.covariance[None])
         elif now == 0.0:
             belief = belief.from_zero()

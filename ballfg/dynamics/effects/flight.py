@@ -7,9 +7,8 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, Range, Scene, Usual, length, vector
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, Range, Scene, Usual, coordinate, length, vector
 from ballfg.state import STANDARD_GRAVITY, Z
-from ballfg.tracks.checks import MAX_COORDINATE
 
 TINY_SPEED: Final = 1e-9
 """m/s. Keeps 0/0 away for a ball that neither moves nor spins; its saturated lift is zero anyway."""
@@ -133,7 +132,7 @@ class WindShear(FlightEffect):
     decide = "Shoot at different heights in one direction, or hold a thread at two heights."
     coefficients = (
         *(Coefficient(axis, 0.0, 0.3, "1/s", -20.0, 20.0) for axis in "xy"),
-        Coefficient("reference", 1.0, 0.5, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
+        coordinate("reference", 1.0, 0.5),
     )
     plausible = Range(-1.0, 1.0, "a draught of 0.5 m/s in the lower half metre of a room and still air above it")
     usual = Usual({"x": 0.5}, "an estimate: half of the strongest that is plausible")
@@ -162,9 +161,9 @@ class GustRegion(FlightEffect):
     decide = "Shoot past the suspected place on both sides: the wind is everywhere, the gust in one place."
     coefficients = (
         *(Coefficient(axis, 0.0, 0.5, "m/s", -20.0, 20.0) for axis in "xyz"),
-        Coefficient("center_x", 1.4, 1.0, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
-        Coefficient("center_y", 0.0, 0.5, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
-        Coefficient("center_z", 1.1, 0.5, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None),
+        coordinate("center_x", 1.4, 1.0),
+        coordinate("center_y", 0.0, 0.5),
+        coordinate("center_z", 1.1, 0.5),
         Coefficient("size", 0.4, 0.2, "m", 0.01, 100.0, absent=None),
     )
     plausible = Range(

@@ -7,10 +7,9 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, vector
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, coordinate, vector
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.state import POSITION, VELOCITY
-from ballfg.tracks.checks import MAX_COORDINATE
 
 WORLD_AXES: Final = ("x", "y", "z")
 FLIGHT_AXES: Final = ("along", "across", "lift")
@@ -80,9 +79,7 @@ def _coefficients(axes: Iterable[str], terms: Terms, bound: float = BOUND) -> tu
 def _center() -> tuple[Coefficient, ...]:
     """The point from which terms in the place are counted."""
     middle = {"center_x": 1.4, "center_y": 0.0, "center_z": 1.0}
-    return tuple(
-        Coefficient(name, m, 0.0, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None) for name, m in middle.items()
-    )
+    return tuple(coordinate(name, m, 0.0) for name, m in middle.items())
 
 
 def _strengths(effect: Effect) -> Tensor:

@@ -8,10 +8,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import SEEN, TINY_LENGTH, Coefficient, Range, Scene, Usual, length, per_row, vector
+from ballfg.dynamics.effect import (
+    SEEN,
+    TINY_LENGTH,
+    Coefficient,
+    Range,
+    Scene,
+    Usual,
+    coordinate,
+    length,
+    per_row,
+    vector,
+)
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.state import POSITION, VELOCITY
-from ballfg.tracks.checks import MAX_COORDINATE
 
 SOFT_DISTANCE: Final = 0.05
 """m. Nearer to its centre than this a radial bias falls to zero, so that it has a direction nowhere and a derivative
@@ -134,7 +144,7 @@ class RadialBias(MeasurementEffect):
     decide = "Measure a ball at rest in several known places: the error points away from the centre."
     coefficients = (
         Coefficient("offset", 0.0, 0.005, "m", -0.5, 0.5),
-        *(Coefficient(axis, 0.0, 1.0, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None) for axis in "xyz"),
+        *(coordinate(axis, 0.0, 1.0) for axis in "xyz"),
     )
     plausible = Range(-0.02, 0.02, "a camera sees the surface, which lies one radius before the centre")
     usual = Usual({"offset": 0.01}, "an estimate: half of a ball's radius")
@@ -161,7 +171,7 @@ class Distortion(MeasurementEffect):
     decide = "Measure rods of known length, or a ball at rest in known places, in the room's middle and at its edges."
     coefficients = (
         Coefficient("k", 0.0, 0.005, "1/m^2", -0.5, 0.5),
-        *(Coefficient(axis, 0.0, 0.5, "m", -MAX_COORDINATE, MAX_COORDINATE, absent=None) for axis in "xyz"),
+        *(coordinate(axis, 0.0, 0.5) for axis in "xyz"),
     )
     plausible = Range(-0.05, 0.05, SEEN)
     usual = Usual({"k": 0.008}, "an estimate: 8 mm at 1 m from the centre")

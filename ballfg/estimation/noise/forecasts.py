@@ -41,6 +41,7 @@ class Score:
     Attributes:
         by_track: (t,) each track's share of the mean negative logarithm of a density, of forecasts and next samples.
         held: share of forecast coordinates inside the central 90 % intervals.
+        derivatives: computes `slopes`, which take longer than the score.
     """
 
     by_track: Array

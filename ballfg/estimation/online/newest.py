@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from ballfg.estimation.online.online import Online
 
 SURELY = 0.5 * AGREES
-"""Squared innovation of the window below which a sample agrees with its flight: another prediction need not tell. Both
-are alike to 1e-5 where no state moved, and never differ by half."""
+"""Squared innovation of the window below which a sample agrees with its flight: another prediction need not tell. On
+`aimy` both are alike to 1e-5 where no state moved, and never differ by half; the states of `strokes`, `robot_rallies`
+and `ballgun` are the same bits with and without this limit."""
 
 
 @dataclass(frozen=True)

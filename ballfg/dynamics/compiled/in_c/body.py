@@ -242,7 +242,7 @@ class Body:
         for root in sorted(roots):
             texts = texts.replace(f"<{root}>double *const", f"{'' if root in self.written else 'const '}double *const")
         joined = _joined(_used([*lines, *texts.split("\n")]))
-        if self.routine.generated:  # steps of a calculation, which nobody reads: half of a header without their spaces
+        if self.routine.generated:  # its long chains of steps are read by nobody, and their spaces are 5 kB
             joined = [TIGHT.sub(r"\1", line) if line.lstrip().startswith("const double ") else line for line in joined]
         return [part for line in joined for part in textwrap.wrap(line, 118, **WRAPPED) or [""]]
 
