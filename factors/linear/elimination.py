@@ -19,10 +19,9 @@ from numba import types
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import put_all
+from ballfg.dynamics.compiled.four_at_once import FOUR_AT_ONCE, behind, load, minus, plus, store, times
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL, THREE, TWO
 
-FOUR_AT_ONCE = 4
-"""Number of values that one instruction multiplies."""
 BLOCK = 64
 """States that are reduced with one room for what they leave to each other, which so stays near the processor."""
 FADED = 1e-13
@@ -74,7 +73,7 @@ def padded(columns: int) -> int:
 def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count: int, column: Array) -> None:
     """Reflects rows begin:end of the system into a triangle, until their columns first:first+count are zero.
 
-    Columns before those are not read again. Four columns at a time fill one register of a processor.
+    Columns before those are not read again.
 
     Args:
         upper: (count, all columns), triangular from column `first` on.
@@ -96,26 +95,14 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
         lead = pivot - diagonal
         scale = -1.0 / (diagonal * lead)
         for k in range((c + 1) // FOUR_AT_ONCE * FOUR_AT_ONCE, system.shape[1], FOUR_AT_ONCE):
-            s0, s1, s2, s3 = lead * upper[j, k], lead * upper[j, k + 1], lead * upper[j, k + 2], lead * upper[j, k + 3]
+            above = load(upper, j, k)
+            shares = times(lead, above)
             for r in range(begin, end):
-                f = column[r - begin]
-                s0 += f * system[r, k]
-                s1 += f * system[r, k + 1]
-                s2 += f * system[r, k + 2]
-                s3 += f * system[r, k + 3]
-            s0 = s0 * scale if k > c else 0.0  # columns up to c are done
-            s1 = s1 * scale if k + 1 > c else 0.0
-            s2 = s2 * scale if k + 2 > c else 0.0
-            s3 *= scale
-            upper[j, k] -= lead * s0
-            upper[j, k + 1] -= lead * s1
-            upper[j, k + 2] -= lead * s2
-            upper[j, k + 3] -= lead * s3
+                shares = plus(shares, times(column[r - begin], load(system, r, k)))
+            shares = behind(c, k, times(scale, shares))  # columns up to c are done
+            store(upper, j, k, minus(above, times(lead, shares)))
             for r in range(begin, end):
-                f = column[r - begin]
-                x0, x1 = system[r, k] - f * s0, system[r, k + 1] - f * s1
-                x2, x3 = system[r, k + 2] - f * s2, system[r, k + 3] - f * s3
-                system[r, k], system[r, k + 1], system[r, k + 2], system[r, k + 3] = x0, x1, x2, x3
+                store(system, r, k, minus(load(system, r, k), times(column[r - begin], shares)))
         upper[j, c] = diagonal
 
 
