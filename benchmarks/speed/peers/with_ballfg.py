@@ -41,26 +41,34 @@ class EulerFactors(FactorBatch):
         self.model, self.dt = model, float(problem.dt)
         self.rates, self.weights = functions.rates, functions.weights(model)[0]
         own = dict(model.named_parameters())
-        self.coefficients = np.array([float(own[name].detach()) for name in functions.rates.names])
+        coefficients = np.array([float(own[name].detach()) for name in functions.rates.names])
         self.root = 1.0 / np.concatenate((problem.step_sigma, np.full(3, HELD)))
+        by_rates = np.repeat((-0.5 * self.dt**2, -self.dt, 0.0), 3)  # of position, velocity and spin after the step
+        self.scale = (by_rates * self.root)[:, None]
+        still = np.eye(STATE_DIM)
+        still[range(3), range(3, 6)] = self.dt
+        self.still = still * self.root[:, None]
+        m = len(states)  # what the rates of all states take and write, and Jacobians by the state after a step
+        self.coefficients, self.fixed = np.tile(coefficients, (m, 1)), np.zeros((m, len(coefficients), 6))
+        self.moved, self.own = np.zeros((m, STATE_DIM, 6)), np.tile(np.diag(self.root), (m, 1, 1))
+        self.moved[:, 3:] = np.eye(6)
+        self.rates_of_all, self.slopes_of_all = np.empty((m, 6)), np.empty((m, 6, 6))
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9)."""
         before, after = np.ascontiguousarray(inputs[0]), inputs[1]
         n, dt = len(before), self.dt
-        moved = np.zeros((n, STATE_DIM, 6))
-        moved[:, 3:] = np.eye(6)
-        c = np.tile(self.coefficients, (n, 1))
-        a, slope = np.empty((n, 6)), np.empty((n, 6, 6))
-        self.rates.compute(before, c, self.weights, moved, np.zeros((n, c.shape[1], 6)), a, slope)
-        shift, by = np.zeros((n, STATE_DIM)), np.tile(np.eye(STATE_DIM), (n, 1, 1))
-        shift[:, POSITION] = dt * before[:, VELOCITY] + 0.5 * dt**2 * a[:, :3]
-        shift[:, VELOCITY] = dt * a[:, :3]
-        by[:, range(3), range(3, 6)] = dt
-        by[:, POSITION, 3:] += 0.5 * dt**2 * slope[:, :3]
-        by[:, VELOCITY, 3:] += dt * slope[:, :3]
-        own = np.broadcast_to(np.diag(self.root), by.shape)
-        return (after - before - shift) * self.root, (-by * self.root[:, None], own)
+        a, slope = self.rates_of_all[:n], self.slopes_of_all[:n]
+        self.rates.compute(before, self.coefficients[:n], self.weights, self.moved[:n], self.fixed[:n], a, slope)
+        residual = after - before
+        residual[:, POSITION] -= dt * before[:, VELOCITY] + 0.5 * dt**2 * a[:, :3]
+        residual[:, VELOCITY] -= dt * a[:, :3]
+        by = np.zeros((n, STATE_DIM, STATE_DIM))
+        by[:, POSITION, 3:] = slope[:, :3]
+        by[:, VELOCITY, 3:] = slope[:, :3]
+        by *= self.scale
+        by -= self.still
+        return residual * self.root, (by, self.own[:n])
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 9) whitened residuals in torch."""
