@@ -38,6 +38,7 @@ def test_table_and_files(shots: Path, tmp_path: Path) -> None:
     assert status("predict", shots, "--model", out, "--observe", 0.3, "--jobs", 1, "--out", tmp_path / "p.csv") == 0
 
 
+@pytest.mark.thorough
 def test_exact_positions_are_no_doubt_and_show_all_other_noise(tmp_path: Path) -> None:
     """Of another simulator, for instance: the positions are known to be better than any tracker's."""
     folder, process = tmp_path / "exact", MotionNoise(acceleration=0.05)

@@ -101,7 +101,7 @@ def test_the_noise_belongs_to_the_stroke() -> None:
     assert np.abs(one - other).max() > 0.5
 
 
-@pytest.mark.parametrize(("share", "scatter"), [(0.0625, False), (1.0, True)])
+@pytest.mark.parametrize(("share", "scatter"), [(0.0625, False), pytest.param(1.0, True, marks=pytest.mark.thorough)])
 def test_scores_of_right_laws_are_those_of_strokes_filmed_again(share: float, scatter: bool) -> None:
     """Without the pull of drag by states nothing is left; where motion scatters as usual it is far from zero."""
     laws = laws_of(share)

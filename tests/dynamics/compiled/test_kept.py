@@ -392,6 +392,7 @@ print(loaded, np.array_equal(y, x @ x.T + 1.0), np.array_equal(z, x @ x.T @ x))
 """
 
 
+@pytest.mark.thorough
 def test_kept_code_runs_without_what_a_compilation_loads_and_a_compilation_after_it_works(tmp_path: Path) -> None:
     (tmp_path / "allocates.py").write_text(ALLOCATES)
 

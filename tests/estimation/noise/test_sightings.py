@@ -38,7 +38,13 @@ def test_the_parts_of_covariances_add_up_and_one_is_round() -> None:
     assert Noise(0.5, 3.0).of(stated) == pytest.approx(0.5 * around + 3.0 * along)
 
 
-@pytest.mark.parametrize("true", [Noise(0.05, 0.3), Noise(1.0, 1.0), Noise(2.0, 0.2)])
+@pytest.mark.parametrize(
+    "true",
+    [
+        Noise(0.05, 0.3),
+        *(pytest.param(true, marks=pytest.mark.thorough) for true in (Noise(1.0, 1.0), Noise(2.0, 0.2))),
+    ],
+)
 def test_the_factors_are_those_of_the_highest_likelihood(true: Noise) -> None:
     rng = np.random.default_rng(1)
     stated = stated_of(rng)

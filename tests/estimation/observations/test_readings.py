@@ -209,7 +209,9 @@ def test_readings_beyond_what_they_state_are_noted() -> None:
     assert re.match(r"the measurements 'speed' lie [\d.]+ times as far", note)
 
 
-@pytest.mark.parametrize("sort", [Smoother, pytest.param(Online, marks=pytest.mark.thorough), ExtendedKalmanFilter])
+@pytest.mark.parametrize(
+    "sort", [Smoother, *(pytest.param(sort, marks=pytest.mark.thorough) for sort in (Online, ExtendedKalmanFilter))]
+)
 def test_innovations_of_speeds_are_standard_normal(sort: type) -> None:
     """The filters' are independent of each other; of the smoother's, one of each track is taken."""
     found = []

@@ -109,7 +109,7 @@ def test_a_copy_has_the_states_of_a_stream_that_was_never_copied(copied: int) ->
     assert (online.scatter.sigma > 0.004).all()
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.0003])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.thorough), 0.0003])
 def test_a_ball_that_lies_before_it_flies_is_known_as_well_as_stated(noise: float) -> None:
     """At rest a tracker repeats positions or averages them; in flight they have 3 mm."""
     rng, squares = np.random.default_rng(14), []

@@ -105,7 +105,9 @@ def filmed(
     return sighted_track("a", seen, [camera], model=MODEL, surfaces=SMOOTHER.surfaces)
 
 
-@pytest.mark.parametrize("view", list(PLACES))
+@pytest.mark.parametrize(
+    "view", ["beside", *(pytest.param(v, marks=pytest.mark.thorough) for v in PLACES if v != "beside")]
+)
 def test_the_number_of_bounces_and_the_distance_hold(view: str) -> None:
     """No bounce is invented; distances are neither too short nor too long, and lie within what is stated."""
     extra, missed, inside, depths, sizes = 0, 0, [], [], []

@@ -19,7 +19,7 @@ def ended(rate: float, after: int, seed: int, table: bf.Surfaces = TABLE) -> tup
     return bf.estimate(bf.Track(times, positions), surfaces=table, settings=settings), truth
 
 
-@pytest.mark.parametrize("rate", [60.0, 100.0, 250.0])
+@pytest.mark.parametrize("rate", [100.0, *(pytest.param(rate, marks=pytest.mark.thorough) for rate in (60.0, 250.0))])
 def test_a_last_state_just_over_an_end_is_known_as_well_as_stated(rate):
     found = []
     for seed in range(6):
