@@ -8,6 +8,7 @@ from torch import Tensor
 from ballfg.arrays import Index
 from ballfg.benchmarks.speed.network import NetworkFlight
 from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout as roll_out
+from ballfg.dynamics.compiled.flight import TOGETHER
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.model_file import model_from_dict
 from ballfg.factors.batch import FactorBatch, Noise, Values
@@ -20,7 +21,8 @@ from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 torch.set_num_threads(1)
-TOLERANCE = 3e-6  # Posterior standard deviations to the minimum: the loosest that meets the comparison on all tracks
+TOLERANCE = 3e-6
+"""Posterior standard deviations of a track to the minimum: the loosest that meets the comparison on all tracks."""
 EXACT = 1e-8  # Relative error of the linear solution of a gradient, fine enough for the comparison
 HELD = 1e-6
 """rad/s, by which the spin may change over a step: one spin for the flight, within all digits that are compared."""
@@ -59,7 +61,10 @@ class EulerFactors(FactorBatch):
         before, after = np.ascontiguousarray(inputs[0]), inputs[1]
         n, dt = len(before), self.dt
         a, slope = self.rates_of_all[:n], self.slopes_of_all[:n]
-        self.rates.compute(before, self.coefficients[:n], self.weights, self.moved[:n], self.fixed[:n], a, slope)
+        for begin in range(0, n, TOGETHER):
+            part = slice(begin, min(begin + TOGETHER, n))
+            given = before[part], self.coefficients[part], self.weights, self.moved[part], self.fixed[part]
+            self.rates.compute(*given, a[part], slope[part])
         residual = after - before
         residual[:, POSITION] -= dt * before[:, VELOCITY] + 0.5 * dt**2 * a[:, :3]
         residual[:, VELOCITY] -= dt * a[:, :3]
@@ -92,12 +97,12 @@ def model_of(problem: Problem) -> BallModel:
 
 
 def estimate(problem: Problem):
-    """Graphs of all tracks, minimised one by one."""
-    optimizer, model = LevenbergMarquardt(TOLERANCE), model_of(problem)
-    pairs = [_posed(problem, model, k) for k in range(len(problem.measured))]
+    """One graph of all tracks, whose states lie behind one another."""
+    tracks, n, _ = problem.measured.shape
+    optimizer, (graph, start) = LevenbergMarquardt(TOLERANCE * tracks**0.5), _posed(problem, model_of(problem))
 
     def solve() -> dict[str, Array]:
-        states = np.stack([optimizer.minimize(*pair).values.states for pair in pairs])
+        states = optimizer.minimize(graph, start).values.states.reshape(tracks, n, STATE_DIM)
         return {"position": states[..., :3], "velocity": states[..., 3:6], "spin": states[:, 0, 6:]}
 
     return solve
@@ -108,7 +113,7 @@ def gradient(problem: Problem):
     model, optimizer = model_of(problem), LevenbergMarquardt()
     own = dict(model.named_parameters())
     drag, magnus = (own[f"flight.{name}.k"].requires_grad_(True) for name in ("drag", "magnus"))
-    graph, start = _posed(problem, model, 0)
+    graph, start = _posed(problem, model)
 
     def solve() -> dict[str, Array]:
         minimum = optimizer.minimize(graph, start)
@@ -130,16 +135,19 @@ def gradient(problem: Problem):
     return solve
 
 
-def _posed(problem: Problem, model: BallModel, track: int) -> tuple[BallGraph, Values]:
-    p, v, w = (part[track] for part in problem.start())
-    n = len(p)
-    label, root = np.zeros((1, STATE_DIM)), np.zeros((1, 3, STATE_DIM))
-    label[0, SPIN] = problem.label[track]
-    root[0, range(3), range(6, 9)] = 1.0 / float(problem.label_sigma)
-    steps = EulerFactors(problem, model, np.arange(n - 1))
-    seen = PositionFactors(np.arange(n), problem.measured[track], np.full((n, 3), float(problem.position_sigma)))
-    labelled = PriorFactors(np.zeros(1, dtype=np.int64), label, root)
-    start = np.concatenate((p, v, np.tile(w, (n, 1))), axis=1)
+def _posed(problem: Problem, model: BallModel) -> tuple[BallGraph, Values]:
+    p, v, w = problem.start()
+    tracks, n, _ = p.shape
+    number = np.arange(tracks * n).reshape(tracks, n)
+    label, root = np.zeros((tracks, STATE_DIM)), np.zeros((tracks, 3, STATE_DIM))
+    label[:, SPIN] = problem.label
+    root[:, range(3), range(6, 9)] = 1.0 / float(problem.label_sigma)
+    steps = EulerFactors(problem, model, number[:, :-1].ravel())
+    seen = PositionFactors(
+        number.ravel(), problem.measured.reshape(-1, 3), np.full((number.size, 3), float(problem.position_sigma))
+    )
+    labelled = PriorFactors(number[:, 0].copy(), label, root)
+    start = np.concatenate((p, v, np.repeat(w[:, None], n, axis=1)), axis=2).reshape(-1, STATE_DIM)
     return BallGraph((steps, seen, labelled)), Values(start, np.zeros(0))
 
 
