@@ -19,7 +19,7 @@ from numba import types
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import put_all
-from ballfg.dynamics.compiled.four_at_once import FOUR_AT_ONCE, behind, load, minus, plus, store, times
+from ballfg.dynamics.compiled.four_at_once import FOUR_AT_ONCE, behind, load, minus, padded, plus, store, times
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL, THREE, TWO
 
 BLOCK = 64
@@ -61,12 +61,6 @@ class Root(NamedTuple):
 
 
 ROOT: Final[Any] = types.NamedTuple((THREE, TWO), Root)
-
-
-@machine_code(COUNT(COUNT))
-def padded(columns: int) -> int:
-    """The next multiple of `FOUR_AT_ONCE`."""
-    return -(-columns // FOUR_AT_ONCE) * FOUR_AT_ONCE
 
 
 @machine_code(NOTHING(TWO, TWO, COUNT, COUNT, COUNT, COUNT, ONE))

@@ -256,7 +256,9 @@ def test_a_crossing_by_the_end_of_a_table_is_that_of_the_balls_that_have_one(wor
     assert found.time_sigma == pytest.approx(np.sqrt(np.square(times.numpy()[at] + 3.0 - found.time).mean()), rel=0.2)
 
 
-@pytest.mark.parametrize("rising", [0.35, -0.05, *(pytest.param(v, marks=pytest.mark.thorough) for v in (0.2, 0.05, -0.2))])
+@pytest.mark.parametrize(
+    "rising", [0.35, -0.05, *(pytest.param(v, marks=pytest.mark.thorough) for v in (0.2, 0.05, -0.2))]
+)
 @pytest.mark.parametrize("text", ["apex", "z=0.15", "z=0.15,down"])
 def test_an_event_that_may_just_have_been_is_in_doubt(world, text, rising):
     """Some balls are at their highest point now, the others after the next bounce; some are above the plane."""

@@ -10,6 +10,9 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, register_model
 
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT
+
 FOUR_AT_ONCE: Final = 4
 """Numbers that one instruction multiplies."""
 NUMBERS: Final = ir.VectorType(ir.DoubleType(), FOUR_AT_ONCE)
@@ -97,3 +100,9 @@ minus: Final[Any] = intrinsic(_minus)
 """minus(one, other): their differences."""
 behind: Final[Any] = intrinsic(_behind)
 """behind(column, first, four): zeros in place of those up to a column, where they stand in the columns from `first`."""
+
+
+@machine_code(COUNT(COUNT))
+def padded(columns: int) -> int:
+    """The next multiple of `FOUR_AT_ONCE`."""
+    return -(-columns // FOUR_AT_ONCE) * FOUR_AT_ONCE

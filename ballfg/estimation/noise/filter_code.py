@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.four_at_once import FOUR_AT_ONCE, load, minus, padded, plus, store, times
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
 from ballfg.state import STATE_DIM
 
@@ -19,42 +20,50 @@ NEXT_TAIL = 4.0
 missed hit must not dominate the noise."""
 
 
-@machine_code(NOTHING(COUNT, REAL, TWO, TWO))
-def _keep(d, decay, x, result):
-    """Writes the rows of x (w, w) that only ones and decays act on; zero for those of the state."""
+@machine_code(NOTHING(TWO, COUNT, COUNT, REAL, TWO, TWO))
+def _carry(factors, rows, d, decay, x, result):
+    """Writes the rows of x (w, k), those of the state carried on: the product of factors and x, and what stays.
+
+    Args: factors (rows or more, any): of rows of x.  d, decay: of ones and decays.  k: `FOUR_AT_ONCE` divides it.
+    """
     for i in range(len(x)):
         own = 0.0 if i < STATE_DIM else 1.0 if i < d else decay
-        for j in range(len(x)):
-            result[i, j] = own * x[i, j]
+        for j in range(0, x.shape[1], FOUR_AT_ONCE):
+            total = times(own, load(x, i, j))
+            if i < rows:
+                for s in range(factors.shape[1]):
+                    total = plus(total, times(factors[i, s], load(x, s, j)))
+            store(result, i, j, total)
 
 
 @machine_code(NOTHING(TWO, REAL, TWO, TWO))
 def move(transition, decay, x, result):
-    """The product F x of a transition and x (w, w).
+    """The product F x of a transition and x (w, k).
 
-    Args: transition (d, d): of state and coefficients.  decay: of biases.
+    Args: transition (d, d): of state and coefficients.  decay: of biases.  k: w or more, `FOUR_AT_ONCE` divides it.
     """
-    d, w = len(transition), len(x)
-    _keep(d, decay, x, result)
-    for i in range(STATE_DIM):
-        for s in range(d):
-            factor = transition[i, s]
-            if factor != 0.0:
-                for j in range(w):
-                    result[i, j] += factor * x[s, j]
+    _carry(transition, STATE_DIM, len(transition), decay, x, result)
 
 
 @machine_code(NOTHING(TWO, REAL, TWO, TWO))
 def pull(transition, decay, x, result):
-    """The product F' x of a transition, as `move` takes it, and x (w, w)."""
-    d, w = len(transition), len(x)
-    _keep(d, decay, x, result)
-    for s in range(STATE_DIM):
-        for i in range(d):
-            factor = transition[s, i]
-            if factor != 0.0:
-                for j in range(w):
-                    result[i, j] += factor * x[s, j]
+    """The product F' x of a transition, as `move` takes it, and x (w, k)."""
+    d = len(transition)
+    turned = np.empty((d, STATE_DIM))
+    for i in range(d):
+        for s in range(STATE_DIM):
+            turned[i, s] = transition[s, i]
+    _carry(turned, d, d, decay, x, result)
+
+
+@machine_code(NOTHING(TWO, TWO))
+def turn(x, result):
+    """The transpose of the first w columns of x (w, k), and the other columns empty."""
+    for i in range(len(x)):
+        for j in range(len(x)):
+            result[j, i] = x[i, j]
+        for j in range(len(x), x.shape[1]):
+            result[i, j] = 0.0
 
 
 @machine_code(NOTHING(TWO, TWO, TWO))
@@ -96,7 +105,7 @@ def invert_root(x, inverse):
 
 @machine_code(NOTHING(TWO, ONE, REAL, THREE, ONE, ONE, ONE, TWO, THREE))
 def _predict(transition, offset, decay, kicks, process, memory, m, p, work):
-    """Moves mean m (w,) and covariance p (w, w) on by one interval; overwrites work (2, w, w)."""
+    """Moves mean m (w,) and covariance p (w, k) on by one interval; overwrites work (2, w, k)."""
     d, w = len(transition), len(m)
     before = m.copy()
     for i in range(STATE_DIM):
@@ -106,7 +115,7 @@ def _predict(transition, offset, decay, kicks, process, memory, m, p, work):
     for i in range(STATE_DIM, d):
         m[i] += offset[i]
     move(transition, decay, p, work[0])
-    work[1] = work[0].T
+    turn(work[0], work[1])
     move(transition, decay, work[1], p)
     for q in range(len(process)):
         if np.trace(kicks[q]) != 0.0:  # few intervals have a contact
@@ -153,9 +162,10 @@ def innovate(d, m, p, error, measured, seen, root, new, weighted):
 
 @machine_code(NOTHING(TWO, TWO, ONE, ONE, TWO, TWO))
 def update(seen, root, new, m, p, gain):
-    """Updates with a sample whose whitened innovation is `new`; writes its gain (w, 3)."""
-    w = len(m)
-    whitened = np.zeros((3, w))
+    """Updates mean m (w,) and covariance p (w, k) with a sample whose whitened innovation is `new`; writes its gain."""
+    w, columns = p.shape[0], p.shape[1]
+    fours = columns - columns % FOUR_AT_ONCE
+    whitened = np.zeros((3, columns))
     for i in range(w):
         for a in range(3):
             for b in range(a + 1):
@@ -166,8 +176,13 @@ def update(seen, root, new, m, p, gain):
                 gain[i, a] += root[b, a] * whitened[b, i]
             m[i] += whitened[a, i] * new[a]
     for i in range(w):
-        for a in range(3):
-            for j in range(w):
+        for j in range(0, fours, FOUR_AT_ONCE):
+            left = load(p, i, j)
+            for a in range(3):
+                left = minus(left, times(whitened[a, i], load(whitened, a, j)))
+            store(p, i, j, left)
+        for j in range(fours, w):
+            for a in range(3):
                 p[i, j] -= whitened[a, i] * whitened[a, j]
 
 
@@ -176,7 +191,7 @@ def _join(d, gain, prior, measured, p, work):
     """The covariance after the first sample, A P A' + K R K' with A = 1 - K H.
 
     A difference would lose ten digits: the prior of the position is that much wider than the posterior. Overwrites
-    `prior` (w, w) and `work` (2, w, w).
+    `prior` (w, w) and `work` (2, w, k); p is (w, k).
     """
     w = len(p)
     kept, half = work[0], work[1]
@@ -188,7 +203,7 @@ def _join(d, gain, prior, measured, p, work):
             if d < w:
                 kept[i, d + a] -= gain[i, a]
     multiply(kept, prior, half)
-    prior[:] = kept.T
+    prior[:] = kept[:, :w].T
     multiply(half, prior, p)
     for a in range(3):
         for b in range(3):
@@ -217,10 +232,11 @@ def filter_tracks(
     """
     count, samples, w = means.shape
     d = transitions.shape[2]
-    seen, new, m, p, work = np.empty((w, 3)), np.empty(3), np.empty(w), np.empty((w, w)), np.empty((2, w, w))
+    seen, new, m = np.empty((w, 3)), np.empty(3), np.empty(w)
+    p, work = np.zeros((w, padded(w))), np.empty((2, w, padded(w)))
     for t in range(count):
         nll[t] = 0.0
-        m[:], p[:] = starts[t], 0.0
+        m[:], p[:] = starts[t], 0.0  # columns behind the last number stay empty
         for i in range(w):
             p[i, i] = priors[t, i]
         for k in range(samples):
@@ -237,10 +253,10 @@ def filter_tracks(
                 nll[t] += 0.5 * square if square < NEXT_TAIL * NEXT_TAIL else tail
                 nll[t] -= math.log(root[0, 0] * root[1, 1] * root[2, 2])
             if used[t, k]:
-                prior = covariances[t, k]
-                prior[:] = p
+                if k == 0:
+                    prior = p[:, :w].copy()
                 update(seen, root, new, m, p, gain)
                 if k == 0:
                     _join(d, gain, prior, measured[t, k], p, work)
-            means[t, k], covariances[t, k] = m, p
+            means[t, k], covariances[t, k] = m, p[:, :w]
     return True

@@ -12,8 +12,9 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.four_at_once import padded
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
-from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, pull
+from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, pull, turn
 from ballfg.state import STATE_DIM
 
 
@@ -86,7 +87,7 @@ def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, t
                 for j in range(STATE_DIM):
                     to_process[q] += kicks[q, i, j] * p[i, j]
     pull(transition, decay, p, work[0])
-    work[1] = work[0].T
+    turn(work[0], work[1])
     for i in range(d, w):
         to_memory[i - d] += p[i, i] * (1.0 - decay * decay)
         to_decay += m[i] * before[i] - 2.0 * decay * memory[i - d] * p[i, i]
@@ -126,7 +127,7 @@ def pull_back(
     """
     count, samples, w = means.shape
     d = transitions.shape[2]
-    m, p, work = np.empty(w), np.empty((w, w)), np.empty((2, w, w))
+    m, p, work = np.empty(w), np.zeros((w, padded(w))), np.empty((2, w, padded(w)))
     for t in range(count):
         m[:], p[:], to_process[t], to_memory[t] = 0.0, 0.0, 0.0, 0.0
         for k in range(samples - 1, -1, -1):
