@@ -19,8 +19,8 @@ from numba import types
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import put_all
-from ballfg.dynamics.compiled.four_at_once import FOUR_AT_ONCE, behind, load, minus, padded, plus, store, times
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.factors.linear.four_at_once import FOUR_AT_ONCE, behind, load, minus, padded, plus, store, times
 
 BLOCK = 64
 """States that are reduced with one room for what they leave to each other, which so stays near the processor."""

@@ -9,8 +9,8 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.four_at_once import FOUR_AT_ONCE, load, minus, padded, plus, store, times
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.factors.linear.four_at_once import FOUR_AT_ONCE, load, minus, padded, plus, store, times
 from ballfg.state import STATE_DIM
 
 NEXT_FROM = 3

@@ -12,9 +12,9 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.four_at_once import padded
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
 from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, pull, turn
+from ballfg.factors.linear.four_at_once import padded
 from ballfg.state import STATE_DIM
 
 
