@@ -24,7 +24,7 @@ bench: $(WARM)  ## the estimator comparison: table, results/results.json, pictur
 		$(BIN)/ballfg-bench estimators --data "$(DATA)/$$set" --out results/$$set || exit 1; \
 	else echo "no measured tracks at $(DATA)/$$set: skipped"; fi; done
 
-test: $(WARM)  ## the tests but for those marked `thorough`: twenty minutes on two slow cores
+test: $(WARM)  ## the tests but for those marked `thorough`: a quarter of an hour on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not thorough"
 
 test-all: $(WARM)  ## all tests: also README, tutorials, cold compilation, fuzz, bombs, signals, full disks, videos, campaigns

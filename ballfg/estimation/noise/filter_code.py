@@ -58,7 +58,7 @@ def pull(transition, decay, x, result):
 
 @machine_code(NOTHING(TWO, TWO))
 def turn(x, result):
-    """The transpose of the first w columns of x (w, k), and the other columns empty."""
+    """The transpose of the first w columns of x (w, k), zeros in the others."""
     for i in range(len(x)):
         for j in range(len(x)):
             result[j, i] = x[i, j]
@@ -236,7 +236,7 @@ def filter_tracks(
     p, work = np.zeros((w, padded(w))), np.empty((2, w, padded(w)))
     for t in range(count):
         nll[t] = 0.0
-        m[:], p[:] = starts[t], 0.0  # columns behind the last number stay empty
+        m[:], p[:] = starts[t], 0.0  # columns behind the last number stay zero
         for i in range(w):
             p[i, i] = priors[t, i]
         for k in range(samples):
