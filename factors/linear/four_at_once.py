@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from llvmlite import ir
 from numba import types
+from numba.core.errors import TypingError
 from numba.extending import intrinsic, models, register_model
 
 from ballfg.dynamics.compiled.build import machine_code
@@ -44,6 +45,8 @@ def _repeated(builder: Any, kind: ir.VectorType, value: Any) -> Any:
 
 
 def _pointer(context: Any, builder: Any, kind: Any, array: Any, row: Any, column: Any) -> Any:
+    if kind.layout != "C" or kind.ndim != 2:
+        raise TypingError(f"array must be a matrix whose rows lie one behind another; got {kind}. Copy it first.")
     whole = context.make_array(kind)(context, builder, array)
     at = builder.add(builder.mul(row, builder.extract_value(whole.shape, 1)), column)
     return builder.bitcast(builder.gep(whole.data, [at], inbounds=True), NUMBERS.as_pointer())
