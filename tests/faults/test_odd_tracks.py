@@ -22,15 +22,22 @@ from tests.faults.odd_tracks import INFO, estimator_of, judged, realistic, sound
 FAST = ("smoother", "sliding-window", "ekf", "online")
 COUNTS = {"smoother": 6, "sliding-window": 16, "ekf": 6, "online": 5}
 """Tracks of each sort; the slower estimators see fewer of them here, and all of them in the whole run."""
+SHORT = partial(wild, longest=0.7)
+LONGEST = [("smoother", SHORT), ("online", SHORT)]
 
 
 def line(times: np.ndarray, velocity: list[float], start: list[float]) -> np.ndarray:
     return times[:, None] * np.array(velocity) + np.array(start)
 
 
-@pytest.mark.parametrize("method", FAST)
-@pytest.mark.parametrize("tracks", [partial(wild, longest=0.7), realistic])
-def test_odd_tracks_end_with_finite_numbers(tracks, method):
+@pytest.mark.parametrize(
+    ("method", "tracks"),
+    [
+        *((method, tracks) for method in FAST for tracks in (realistic, SHORT) if (method, tracks) not in LONGEST),
+        *(pytest.param(*case, marks=pytest.mark.thorough) for case in LONGEST),
+    ],
+)
+def test_odd_tracks_end_with_finite_numbers(method, tracks):
     tally = judged(estimator_of(method), list(tracks(COUNTS[method], seed=5)), verbose=True)
     assert (tally.raised, tally.not_finite, tally.warned, tally.far) == (0, 0, 0, 0)
     assert tally.ok > tally.tracks / 3

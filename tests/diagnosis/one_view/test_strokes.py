@@ -73,6 +73,7 @@ def foretold_bounce(stroke: Stroke) -> float:
     return float(contact.time - stroke.estimate.times[0])
 
 
+@pytest.mark.thorough
 def test_strokes_filmed_again_scatter_as_the_laws_do() -> None:
     """About the path of the estimated first state, at true times, as far as that state and the motion's noise say."""
     laws = laws_of(0.5)
