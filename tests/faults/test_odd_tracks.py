@@ -22,8 +22,8 @@ from tests.faults.odd_tracks import INFO, estimator_of, judged, realistic, sound
 FAST = ("smoother", "sliding-window", "ekf", "online")
 COUNTS = {"smoother": 6, "sliding-window": 16, "ekf": 6, "online": 5}
 """Tracks of each sort; the slower estimators see fewer of them here, and all of them in the whole run."""
-SHORT = partial(wild, longest=0.7)
-LONGEST = [("smoother", SHORT), ("online", SHORT)]
+WILD = partial(wild, longest=0.7)
+SLOW = [("smoother", WILD), ("online", WILD)]
 
 
 def line(times: np.ndarray, velocity: list[float], start: list[float]) -> np.ndarray:
@@ -33,8 +33,8 @@ def line(times: np.ndarray, velocity: list[float], start: list[float]) -> np.nda
 @pytest.mark.parametrize(
     ("method", "tracks"),
     [
-        *((method, tracks) for method in FAST for tracks in (realistic, SHORT) if (method, tracks) not in LONGEST),
-        *(pytest.param(*case, marks=pytest.mark.thorough) for case in LONGEST),
+        *((method, tracks) for method in FAST for tracks in (realistic, WILD) if (method, tracks) not in SLOW),
+        *(pytest.param(*case, marks=pytest.mark.thorough) for case in SLOW),
     ],
 )
 def test_odd_tracks_end_with_finite_numbers(method, tracks):

@@ -2,6 +2,9 @@
 
 Of w numbers the first nine are the state; the next, up to d, are coefficients, which stay; the last three, if d < w,
 are biases, which decay. So a transition is nine rows of numbers, then ones, then decays on the diagonal.
+
+Rows of a covariance end with zeros, so that their k columns are a multiple of what one instruction adds at once: with w
+columns, loops take a third longer.
 """
 
 import math
@@ -10,7 +13,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
-from ballfg.factors.linear.four_at_once import FOUR_AT_ONCE, load, minus, padded, plus, store, times
+from ballfg.factors.linear.four_at_once import padded
 from ballfg.state import STATE_DIM
 
 NEXT_FROM = 3
@@ -20,50 +23,42 @@ NEXT_TAIL = 4.0
 missed hit must not dominate the noise."""
 
 
-@machine_code(NOTHING(TWO, COUNT, COUNT, REAL, TWO, TWO))
-def _carry(factors, rows, d, decay, x, result):
-    """Writes the rows of x (w, k), those of the state carried on: the product of factors and x, and what stays.
-
-    Args: factors (rows or more, any): of rows of x.  d, decay: of ones and decays.  k: `FOUR_AT_ONCE` divides it.
-    """
+@machine_code(NOTHING(COUNT, REAL, TWO, TWO))
+def _keep(d, decay, x, result):
+    """Writes the rows of x (w, k) that only ones and decays act on; zero for those of the state."""
     for i in range(len(x)):
         own = 0.0 if i < STATE_DIM else 1.0 if i < d else decay
-        for j in range(0, x.shape[1], FOUR_AT_ONCE):
-            total = times(own, load(x, i, j))
-            if i < rows:
-                for s in range(factors.shape[1]):
-                    total = plus(total, times(factors[i, s], load(x, s, j)))
-            store(result, i, j, total)
+        for j in range(x.shape[1]):
+            result[i, j] = own * x[i, j]
 
 
 @machine_code(NOTHING(TWO, REAL, TWO, TWO))
 def move(transition, decay, x, result):
     """The product F x of a transition and x (w, k).
 
-    Args: transition (d, d): of state and coefficients.  decay: of biases.  k: w or more, `FOUR_AT_ONCE` divides it.
+    Args: transition (d, d): of state and coefficients.  decay: of biases.
     """
-    _carry(transition, STATE_DIM, len(transition), decay, x, result)
+    d, columns = len(transition), x.shape[1]
+    _keep(d, decay, x, result)
+    for i in range(STATE_DIM):
+        for s in range(d):
+            factor = transition[i, s]
+            if factor != 0.0:
+                for j in range(columns):
+                    result[i, j] += factor * x[s, j]
 
 
 @machine_code(NOTHING(TWO, REAL, TWO, TWO))
 def pull(transition, decay, x, result):
     """The product F' x of a transition, as `move` takes it, and x (w, k)."""
-    d = len(transition)
-    turned = np.empty((d, STATE_DIM))
-    for i in range(d):
-        for s in range(STATE_DIM):
-            turned[i, s] = transition[s, i]
-    _carry(turned, d, d, decay, x, result)
-
-
-@machine_code(NOTHING(TWO, TWO))
-def turn(x, result):
-    """The transpose of the first w columns of x (w, k), zeros in the others."""
-    for i in range(len(x)):
-        for j in range(len(x)):
-            result[j, i] = x[i, j]
-        for j in range(len(x), x.shape[1]):
-            result[i, j] = 0.0
+    d, columns = len(transition), x.shape[1]
+    _keep(d, decay, x, result)
+    for s in range(STATE_DIM):
+        for i in range(d):
+            factor = transition[s, i]
+            if factor != 0.0:
+                for j in range(columns):
+                    result[i, j] += factor * x[s, j]
 
 
 @machine_code(NOTHING(TWO, TWO, TWO))
@@ -115,7 +110,7 @@ def _predict(transition, offset, decay, kicks, process, memory, m, p, work):
     for i in range(STATE_DIM, d):
         m[i] += offset[i]
     move(transition, decay, p, work[0])
-    turn(work[0], work[1])
+    work[1, :, :w] = work[0, :, :w].T
     move(transition, decay, work[1], p)
     for q in range(len(process)):
         if np.trace(kicks[q]) != 0.0:  # few intervals have a contact
@@ -163,8 +158,7 @@ def innovate(d, m, p, error, measured, seen, root, new, weighted):
 @machine_code(NOTHING(TWO, TWO, ONE, ONE, TWO, TWO))
 def update(seen, root, new, m, p, gain):
     """Updates mean m (w,) and covariance p (w, k) with a sample whose whitened innovation is `new`; writes its gain."""
-    w, columns = p.shape[0], p.shape[1]
-    fours = columns - columns % FOUR_AT_ONCE
+    w, columns = p.shape
     whitened = np.zeros((3, columns))
     for i in range(w):
         for a in range(3):
@@ -176,13 +170,8 @@ def update(seen, root, new, m, p, gain):
                 gain[i, a] += root[b, a] * whitened[b, i]
             m[i] += whitened[a, i] * new[a]
     for i in range(w):
-        for j in range(0, fours, FOUR_AT_ONCE):
-            left = load(p, i, j)
-            for a in range(3):
-                left = minus(left, times(whitened[a, i], load(whitened, a, j)))
-            store(p, i, j, left)
-        for j in range(fours, w):
-            for a in range(3):
+        for a in range(3):
+            for j in range(columns):
                 p[i, j] -= whitened[a, i] * whitened[a, j]
 
 
@@ -233,10 +222,10 @@ def filter_tracks(
     count, samples, w = means.shape
     d = transitions.shape[2]
     seen, new, m = np.empty((w, 3)), np.empty(3), np.empty(w)
-    p, work = np.zeros((w, padded(w))), np.empty((2, w, padded(w)))
+    p, work = np.zeros((w, padded(w))), np.zeros((2, w, padded(w)))
     for t in range(count):
         nll[t] = 0.0
-        m[:], p[:] = starts[t], 0.0  # columns behind the last number stay zero
+        m[:], p[:] = starts[t], 0.0
         for i in range(w):
             p[i, i] = priors[t, i]
         for k in range(samples):

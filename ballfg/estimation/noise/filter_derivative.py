@@ -13,7 +13,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
-from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, pull, turn
+from ballfg.estimation.noise.filter_code import NEXT_FROM, NEXT_TAIL, pull
 from ballfg.factors.linear.four_at_once import padded
 from ballfg.state import STATE_DIM
 
@@ -77,7 +77,7 @@ def _before_update(d, gain, root, weighted, square, updated, share, m, p, to_mea
 def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, to_process, to_memory, work):
     """Derivatives by mean and covariance before an interval, from those after it; adds those by its noise.
 
-    Args: before (w,), spread (w, w): mean and covariance at its begin.  work (2, w, w) is written to.
+    Args: before (w,), spread (w, w): mean and covariance at its begin.  work (2, w, k) is written to.
     Returns: the derivative by the decay.
     """
     d, w, to_decay = len(transition), len(m), 0.0
@@ -87,7 +87,7 @@ def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, t
                 for j in range(STATE_DIM):
                     to_process[q] += kicks[q, i, j] * p[i, j]
     pull(transition, decay, p, work[0])
-    turn(work[0], work[1])
+    work[1, :, :w] = work[0, :, :w].T
     for i in range(d, w):
         to_memory[i - d] += p[i, i] * (1.0 - decay * decay)
         to_decay += m[i] * before[i] - 2.0 * decay * memory[i - d] * p[i, i]
@@ -127,7 +127,7 @@ def pull_back(
     """
     count, samples, w = means.shape
     d = transitions.shape[2]
-    m, p, work = np.empty(w), np.zeros((w, padded(w))), np.empty((2, w, padded(w)))
+    m, p, work = np.empty(w), np.zeros((w, padded(w))), np.zeros((2, w, padded(w)))
     for t in range(count):
         m[:], p[:], to_process[t], to_memory[t] = 0.0, 0.0, 0.0, 0.0
         for k in range(samples - 1, -1, -1):

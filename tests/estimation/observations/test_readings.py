@@ -209,9 +209,7 @@ def test_readings_beyond_what_they_state_are_noted() -> None:
     assert re.match(r"the measurements 'speed' lie [\d.]+ times as far", note)
 
 
-@pytest.mark.parametrize(
-    "sort", [Smoother, *(pytest.param(sort, marks=pytest.mark.thorough) for sort in (Online, ExtendedKalmanFilter))]
-)
+@pytest.mark.parametrize("sort", [Smoother, pytest.param(Online, marks=pytest.mark.thorough), ExtendedKalmanFilter])
 def test_innovations_of_speeds_are_standard_normal(sort: type) -> None:
     """The filters' are independent of each other; of the smoother's, one of each track is taken."""
     found = []
@@ -270,7 +268,9 @@ def bounced_with_a_fast_radar(seed: int) -> tuple[Track, np.ndarray]:
     return track.observed(RadarSpeed.at(track, readings, speeds, 0.02)), truth
 
 
-@pytest.mark.parametrize("sort", [Smoother, pytest.param(Online, marks=pytest.mark.thorough), ExtendedKalmanFilter])
+@pytest.mark.parametrize(
+    "sort", [Smoother, *(pytest.param(sort, marks=pytest.mark.thorough) for sort in (Online, ExtendedKalmanFilter))]
+)
 def test_speeds_between_stamps_leave_covariances_honest(sort: type) -> None:
     """From the first sample on, where a filter knows no velocity, and beside bounces that lie between the stamps."""
     settings = Settings.for_measured(nominal_model(), position_noise=(0.003,) * 3)
