@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -136,14 +137,15 @@ class Forecaster:
         """The derivatives of the score by the noise. Args: weight: of the densities of the next samples."""
         ahead, share = self._ahead, 1.0 / count
         by_variance = share * looked.by_variance
-        begins, ends = (ahead.track, ahead.start), (ahead.track, ahead.sample)
         by_means, by_covariances = np.zeros(filtered.means.shape), np.zeros(filtered.covariances.shape)
-        np.add.at(by_means, begins, share * np.einsum("saw,sa->sw", looked.observe, looked.by_predicted))
+        own = share * np.einsum("saw,sa->sw", looked.observe, looked.by_predicted)
         weighted = (looked.observe * by_variance[..., None]).swapaxes(1, 2) @ looked.observe
-        np.add.at(by_covariances, begins, weighted)
+        for rows in ahead.apart:
+            by_means[ahead.track[rows], ahead.start[rows]] += own[rows]
+            by_covariances[ahead.track[rows], ahead.start[rows]] += weighted[rows]
         by, by_decays = self.filter.slopes(filtered, weight, (by_means, by_covariances))
-        for axis in range(3):
-            np.add.at(by.measured[..., axis, axis], ends, by_variance[:, axis])
+        for rows in ahead.apart:
+            by.measured[ahead.track[rows, None], ahead.sample[rows, None], range(3), range(3)] += by_variance[rows]
         np.add.at(by.process, ahead.track, np.einsum("sa,saq->sq", by_variance, ahead.kicks))
         decay, memory = looked.decay, filtered.variances.memory[ahead.track]
         if self.filter.biases:
@@ -185,6 +187,7 @@ class _Ahead:
         by_state: (s, 3, d) derivative of the position by state and coefficients at the origin.
         kicks: (s, 3, 7) m^2, the position's variance per axis for a unit of each number of `PROCESS_NOISE`.
         offsets: (s, 3) m, the sum of the estimate's offsets on the way.
+        apart: the s forecasts in parts, in each of which no two have an origin or a forecast sample in common.
     """
 
     track: Index
@@ -194,6 +197,7 @@ class _Ahead:
     by_state: Array
     kicks: Array
     offsets: Array
+    apart: list[slice]
 
     @classmethod
     def of(cls, tracks: LinearTracks, starts: Index) -> _Ahead:
@@ -201,12 +205,16 @@ class _Ahead:
         (track, start), (samples, own) = starts.T, (tracks.times.shape[1], tracks.transitions.shape[-1])
         begin, reached, horizons, found = tracks.times[track, start], np.zeros(len(track)), np.array(HORIZONS), []
         way, shifted = np.tile(np.eye(own), (len(track), 1, 1)), np.zeros((len(track), own))
-        kicks = np.zeros((len(track), *tracks.kicks.shape[2:]))
+        fresh_kicks = np.ascontiguousarray(tracks.kicks.swapaxes(2, 3))  # (t, n - 1, 9, 7, 9): few large products
+        kicks = np.zeros((len(track), *fresh_kicks.shape[2:]))
         for ahead in range(1, samples):
             interval = np.minimum(start + ahead - 1, samples - 2)
             step = tracks.transitions[track, interval]
-            moved = step[:, None, :STATE_DIM, :STATE_DIM]
-            way, kicks = step @ way, moved @ kicks @ moved.swapaxes(-1, -2) + tracks.kicks[track, interval]
+            moved = step[:, :STATE_DIM, :STATE_DIM]
+            kicks = (moved @ kicks.reshape(len(track), STATE_DIM, -1)).reshape(len(track), -1, STATE_DIM)
+            kicks = (kicks @ moved.swapaxes(-1, -2)).reshape(len(track), *fresh_kicks.shape[2:])
+            kicks += fresh_kicks[track, interval]
+            way = step @ way
             shifted = (step @ shifted[..., None])[..., 0] + tracks.offsets[track, interval]
             sample = np.minimum(start + ahead, samples - 1)
             elapsed = tracks.times[track, sample] - begin
@@ -214,9 +222,10 @@ class _Ahead:
             due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None] + STAMP_TOLERANCE)).any(axis=1)
             rows = np.flatnonzero(fresh & due)
             reached = np.where(fresh, elapsed + STAMP_TOLERANCE, reached)
-            gathered = np.diagonal(kicks[rows][..., POSITION, POSITION], axis1=-2, axis2=-1).swapaxes(-1, -2)
+            gathered = np.diagonal(kicks[rows][:, POSITION, :, POSITION], axis1=1, axis2=3).swapaxes(-1, -2)
             found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, shifted[rows, POSITION]))
             if (reached >= HORIZONS[-1]).all():
                 break
         rows, *rest = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return cls(track[rows], start[rows], *rest)
+        ends = np.cumsum([0, *(len(parts[0]) for parts in found)]).tolist()
+        return cls(track[rows], start[rows], *rest, apart=[slice(*part) for part in pairwise(ends)])
