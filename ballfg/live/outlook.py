@@ -1,6 +1,5 @@
 """Predicts a ball's next bounce, its apex and the crossing of a plane, without exceptions."""
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_json
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
@@ -125,11 +125,11 @@ def answer(update: BallUpdate, outlook: Outlook | None, tag: tuple[tuple[str, An
     if update.kind == "state" and update.state is not None and outlook is not None:
         fields |= _state(update, outlook)
     else:
-        fields |= {"t_input": _number(update.time)}
+        fields |= {"t_input": update.time}
         fields |= {"samples": update.samples} if update.samples else {}
         fields |= {"reason": update.reason} if update.reason else {}
     if update.position is not None:
-        fields["measured"] = _numbers(update.position)
+        fields["measured"] = update.position.tolist()
     return fields | dict(tag)
 
 
@@ -139,9 +139,8 @@ def refusal(reason: str) -> Fields:
 
 
 def encoded(fields: Fields, latency: float) -> bytes:
-    """A line with its latency, ms."""
-    text = json.dumps(fields, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    return f'{text[:-1]},"latency_ms":{latency:.3f}}}\n'.encode()
+    """A line with its latency, ms; numbers that are not finite are null, since JSON has none."""
+    return b'%b,"latency_ms":%.3f}\n' % (to_json(fields, inf_nan_mode="null")[:-1], latency)
 
 
 def _state(update: BallUpdate, outlook: Outlook) -> Fields:
@@ -154,18 +153,18 @@ def _state(update: BallUpdate, outlook: Outlook) -> Fields:
         "late": update.late,
         "samples": update.samples,
         "status": state.status.name.lower(),
-        "position": _numbers(state.mean[POSITION]),
-        "velocity": _numbers(state.mean[VELOCITY]),
-        "spin": _numbers(state.mean[SPIN]),
-        "covariance": [_numbers(row) for row in state.covariance],
-        "innovation": _numbers(state.innovation) if np.isfinite(state.innovation).all() else None,
+        "position": state.mean[POSITION].tolist(),
+        "velocity": state.mean[VELOCITY].tolist(),
+        "spin": state.mean[SPIN].tolist(),
+        "covariance": state.covariance.tolist(),
+        "innovation": state.innovation.tolist() if np.isfinite(state.innovation).all() else None,
         "events": [
             {"kind": e.kind, "t": e.time} | ({} if e.height is None else {"z": e.height}) for e in update.events
         ],
         "bounce": _crossing(outlook.bounce),
         "apex": _crossing(outlook.apex),
         "crossing": _crossing(outlook.crossing),
-        "probability": None if chances is None else {what: _number(chance) for what, chance in chances.items()},
+        "probability": chances,
         "note": "; ".join(text for text in (update.reason, outlook.note) if text),
     }
 
@@ -175,16 +174,7 @@ def _crossing(event: Crossing | None) -> Fields | None:
         return None
     return {
         "t": event.time,
-        "sigma_t": _number(event.time_sigma),
-        "state": _numbers(event.state),
-        "sigma": _numbers(np.sqrt(np.maximum(np.diagonal(event.covariance), 0.0))),
+        "sigma_t": event.time_sigma,
+        "state": event.state.tolist(),
+        "sigma": np.sqrt(np.maximum(np.diagonal(event.covariance), 0.0)).tolist(),
     }
-
-
-def _numbers(values: Array) -> list[float | None]:
-    """Numbers for JSON, which has no NaN."""
-    return [_number(x) for x in values.tolist()]
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
