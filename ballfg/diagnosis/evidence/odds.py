@@ -35,10 +35,14 @@ class Odds:
         return self.of(NAMELESS)
 
     def alike(self, name: str, model: frozenset[str]) -> list[str]:
-        """Effects that can hardly be told from one of a model: in its place they are at least `ALIKE` as probable."""
+        """Effects that can hardly be told from one of a model: in its place they are at least `ALIKE` as probable.
+
+        The most probable one comes first.
+        """
         least, rest = self.models[model] * ALIKE, model - {name}
-        others = [names for names, p in self.models.items() if p > least and rest < names and name not in names]
-        return sorted({other for names in others for other in names - rest} - {NAMELESS})
+        others = {names: p for names, p in self.models.items() if p > least and rest < names and name not in names}
+        listed = sorted(others, key=lambda names: (-others[names], sorted(names)))
+        return list(dict.fromkeys(other for names in listed for other in sorted(names - rest - {NAMELESS})))
 
     def together(self, name: str, model: frozenset[str]) -> float:
         """Probability that an effect of a model is there, or one of those that can hardly be told from it."""
@@ -53,11 +57,11 @@ class Odds:
 
 def odds_of(models: Sequence[Weighed]) -> Odds:
     """The probabilities of all models, of the smaller ones that they hold, and of their neighbours."""
-    scores = scores_of(models)
+    scores = scores_of(models, doubtful=True)
     return Odds(dict(zip(scores, special.softmax(list(scores.values())).tolist(), strict=True)))
 
 
-def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
+def scores_of(models: Sequence[Weighed], *, doubtful: bool = False) -> dict[frozenset[str], float]:
     """Logarithm of the odds of all models, of the smaller ones that they hold, and of their neighbours, by their names.
 
     Each half is predicted with the coefficients of the other. If further effects are there, they gain about as much
@@ -66,6 +70,8 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
 
     Models that no refit weighed count as foretold, and lose what those lose whose linearisations foretell them. Beside
     patterns each weight is of a linearisation, and the best counts.
+
+    Args: doubtful: take off what `_doubt` says. A search hopes for the best and refits it.
     """
     lost = {model.names: -np.inf for model in models if not np.isfinite(model.evidence)}
     models = [model for model in models if np.isfinite(model.evidence)]
@@ -74,7 +80,8 @@ def scores_of(models: Sequence[Weighed]) -> dict[frozenset[str], float]:
     found: dict[frozenset[str], float] = {}
     for model in models:
         for names, score in foretold(model, {**model.nested, **model.neighbours}, scores, weighed).items():
-            found[names] = max(score, found.get(names, -np.inf))
+            less = _doubt(model, names, weighed) if doubtful else 0.0
+            found[names] = max(score - less, found.get(names, -np.inf))
     beside = {n: max(scores[n], found[n]) for n in scores.keys() & found.keys() if NAMELESS in n}
     return lost | found | scores | beside
 
@@ -93,6 +100,22 @@ def foretold(
     """
     lost, known = scores[model.names] - model.score, others if NAMELESS in model.names else weighed
     return {n: min(lost + w.score, tempered(n, w, known) + w.odds) for n, w in others.items()}
+
+
+def _doubt(model: Weighed, names: frozenset[str], weighed: Mapping[frozenset[str], Weight]) -> float:
+    """What a model with another effect in the place of one, as a linearisation foretells it, may gain too much.
+
+    Far beyond the linear range the linearisation foretells that the tracks hardly need the effect, and so nothing in
+    its place. Where a refit without it says that they do, the other one loses the difference, up to the share of the
+    effect's own gain that it foretells.
+    """
+    rest = names & model.names
+    without, known = model.nested.get(rest), weighed.get(rest)
+    if without is None or known is None or not len(rest) + 1 == len(names) == len(model.names):
+        return 0.0
+    needed, other = model.score - without.score, model.neighbours[names].score - without.score
+    share = min(max(other, 0.0) / needed, 1.0) if needed > 0.0 else 0.0
+    return (1.0 - share) * max(without.evidence - known.evidence, 0.0)
 
 
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:

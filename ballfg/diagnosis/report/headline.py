@@ -34,6 +34,7 @@ SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "lik
 SKEWED: Final = 1.5  # Ratio of the root mean square to the median track's error beyond which the median is reported
 MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
 """Effects whose detectable size is in the first lines of a report without findings."""
+MOST_OTHERS: Final = 3  # Largest number of effects that a sentence lists beside one that it cannot tell them from
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
 
 
@@ -76,8 +77,7 @@ def headline(diagnosis: Diagnosis) -> str:
     """The answer for a reader without knowledge of the model and statistics, and the gain of predictions."""
     effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
     if not effects and diagnosis.verdict is not Verdict.UNEXPLAINED:
-        nothing = f"Nothing that the model lacks was found: its predictions are off by {_error(diagnosis)}"
-        return f"{nothing}, and what is left looks like noise."
+        return f"Nothing that the model lacks was found: {_quality(diagnosis)}, and what is left looks like noise."
     if not effects:
         left = where(diagnosis.unexplained.where)
         said = f"Something is missing from the model that no known effect explains: {left}."
@@ -189,7 +189,7 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
         )
         yield "Once there are more tracks, look again:", f"ballfg diagnose {datasets}{given} --out {again}"
     for finding in (f for f in diagnosis.findings if f.indistinguishable_from):
-        for name in (finding.name, *finding.indistinguishable_from):
+        for name in (finding.name, *finding.indistinguishable_from[:MOST_OTHERS]):
             decide = finding.decide if name == finding.name else EFFECTS[name].decide if name in EFFECTS else ""
             if decide:
                 yield f"To find out whether it is {wording.plain_name(name)}: {decide}", ""
@@ -257,7 +257,16 @@ def _sure_word(p: float) -> str:
 
 
 def _or(names: Sequence[str]) -> str:
-    return " or ".join(wording.plain_name(name) for name in names)
+    more = len(names) - MOST_OTHERS
+    of_more = [f"one of {more} others"] if more > 0 else []
+    return " or ".join([*(wording.plain_name(name) for name in names[:MOST_OTHERS]), *of_more])
+
+
+def _quality(diagnosis: Diagnosis) -> str:
+    """How well a model without additions predicts."""
+    if medians := skewed_medians(diagnosis.after, diagnosis.after):
+        return f"half of the tracks are predicted to {wording.fixed(medians[0], 1)} mm or better"
+    return f"its predictions are off by {_error(diagnosis)}"
 
 
 def _error(diagnosis: Diagnosis) -> str:

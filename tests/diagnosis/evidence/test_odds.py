@@ -189,6 +189,19 @@ def test_neighbours_that_no_refit_weighed_count_as_foretold():
     assert odds.of("frame_tilt") < 0.01
 
 
+@pytest.mark.parametrize(("foretold", "refitted", "there"), [(19.9, -80.0, True), (-40.0, -80.0, False)])
+def test_in_the_place_of_an_effect_far_beyond_the_linear_range_nothing_is_as_good(foretold, refitted, there):
+    """About a gust the linearisation foretells that nothing needs it, and any effect does as well, or that they do."""
+    nothing, gust = model([], refitted), model(["gust_region"], 20.0)
+    gust.nested = {frozenset(): Weight(foretold, 0.0, np.full(10, foretold / 10.0), 0.0)}
+    others = [model(["wind"], 20.0), model(["frame_tilt"], foretold)]
+    gust.neighbours = {one.names: one for one in others}
+    odds = odds_of([nothing, gust])
+    assert (odds.of("gust_region") > 0.99) is there
+    assert odds.of("wind") == pytest.approx(0.0 if there else 0.5, abs=0.01)
+    assert odds.of("frame_tilt") < 0.01
+
+
 def test_which_sets_were_weighed_without_patterns_too_does_not_decide_beside_them():
     """The wind was, and its gain beside patterns is not borne out over that; nobody knows of the scale's."""
     nothing, wind = model([], 0.0), model(["wind"], 10.0, np.full(10, 6.9))
@@ -207,6 +220,8 @@ def test_effects_that_cannot_be_told_apart_are_there_together():
     odds, best = odds_of([nothing, *group]), group[1].names
     assert 0.5 < odds.of("scale") < 0.6
     assert odds.alike("scale", best) == ["time_scale"]
+    more = odds_of([nothing, *group, model(["drag_spin", "wind"], 59.0)])
+    assert more.alike("scale", best) == ["time_scale", "drag_spin"]
     assert odds.together("scale", best) > 0.99
     assert odds.alike("wind", best) == []
     assert odds.together("wind", best) == pytest.approx(odds.of("wind"))

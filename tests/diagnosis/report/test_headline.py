@@ -53,6 +53,22 @@ def test_what_cannot_be_told_apart_is_said_with_the_experiment_that_decides() ->
     assert said[1] == f"To find out whether it is a wind in one part of the room: {EFFECTS['gust_region'].decide}"
 
 
+def test_of_many_effects_that_cannot_be_told_apart_the_first_three_are_listed():
+    others = ("gust_region", "frame_tilt", "gravity", "scale", "time_scale")
+    many = replace(found(), findings=(replace(WIND, indistinguishable_from=others),))
+    assert "one part of the room or axes that are not level or the ball's weight or one of 2 others:" in headline(many)
+    hints = [words for words, command in advice(many, ORIGIN) if words.startswith("To find out")]
+    assert [words.partition(": ")[0].rpartition(" it is ")[2] for words in hints] == [
+        "a wind", "a wind in one part of the room", "axes that are not level", "the ball's weight",
+    ]  # fmt: skip
+
+
+def test_one_track_that_misses_the_table_does_not_speak_for_all():
+    errors = np.append(np.full(19, 5.0), 2000.0)
+    off = replace(silent().after, by_track=errors, prediction_rmse_mm=float(np.sqrt((errors**2).mean())))
+    assert "half of the tracks are predicted to 5.0 mm or better" in headline(replace(silent(), after=off, before=off))
+
+
 def test_nothing_found_says_so_and_what_that_rests_on() -> None:
     said = headline(silent())
     assert said.startswith("Nothing that the model lacks was found: its predictions are off by ")
