@@ -8,9 +8,10 @@ import torch
 from ballfg.dynamics import Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import substitute, take_rows
-from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
+from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian
 from ballfg.dynamics.motion.rollout import advance
+from tests.dynamics.in_tensors import fly_through_jacobian
 
 NAMES = (
     "flight.drag.k",

@@ -1,7 +1,5 @@
 """Answers torch's motions, where no derivatives are asked, by machine code."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -16,11 +14,12 @@ from ballfg.dynamics.surfaces import Surfaces
 def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
     """As `integrate.fly`, without derivatives."""
     if state.dim() == 2 and dt.shape == state.shape[:1]:
-        return torch.from_numpy(motion.Moving(model, functions, _plain(state), 0).travel(_plain(dt), _levels(state))[0])
+        after, _, _ = motion.Moving(model, functions, _plain(state), 0).travel(_plain(dt), motion.levels(len(state)))
+        return torch.from_numpy(after)
     shape = np.broadcast_shapes(state.shape[:-1], dt.shape)  # torch's own imports sympy, which takes a second
     rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
     durations = _plain(dt.detach().expand(shape).reshape(-1))
-    after, _, _ = motion.Moving(model, functions, _plain(rows), 0).travel(durations, _levels(rows))
+    after, _, _ = motion.Moving(model, functions, _plain(rows), 0).travel(durations, motion.levels(len(rows)))
     return torch.from_numpy(after).reshape(*shape, state.shape[-1])
 
 
@@ -42,15 +41,6 @@ def roll(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, 
     return torch.from_numpy(after).reshape(*shape, state.shape[-1])
 
 
-def roll_jacobian(
-    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, height: Tensor | float
-) -> tuple[Tensor, Tensor]:
-    """As `rollout.roll_jacobian`."""
-    moving = motion.Moving(model, functions, _plain(state), state.shape[-1])
-    after, jacobian = moving.roll(_plain(dt), _numbers(height, dt.shape))
-    return torch.from_numpy(after), torch.from_numpy(jacobian)
-
-
 def roll_out(model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor:
     """Durations (n, k) s one after another, as in `rollout.rollout`: states (n, k, 9)."""
     moving = motion.Moving(model, functions, _plain(state), 0)
@@ -68,32 +58,11 @@ def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: 
     """As `integrate.fly_jacobian`."""
     shape, width = state.shape, state.shape[-1]
     rows, durations = (state, dt) if dt.dim() == 1 else (state.reshape(-1, width), dt.reshape(-1))
-    after, jacobian, _ = motion.Moving(model, functions, _plain(rows), width).travel(_plain(durations), _levels(rows))
+    moving = motion.Moving(model, functions, _plain(rows), width)
+    after, jacobian, _ = moving.travel(_plain(durations), motion.levels(len(rows)))
     return torch.from_numpy(after.reshape(shape)), torch.from_numpy(jacobian.reshape(*shape, width))
-
-
-def fly_through(
-    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
-) -> tuple[Tensor, Tensor]:
-    """As `contact.fly_through`, without derivatives."""
-    after, _, times = motion.Moving(model, functions, _plain(state), 0).travel(_plain(dt), _levels(state, heights))
-    return torch.from_numpy(after), torch.from_numpy(times)
-
-
-def fly_through_jacobian(
-    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As `contact.fly_through_jacobian`."""
-    moving = motion.Moving(model, functions, _plain(state), state.shape[-1])
-    after, jacobian, times = moving.travel(_plain(dt), _levels(state, heights))
-    return torch.from_numpy(after), torch.from_numpy(times), torch.from_numpy(jacobian)
 
 
 def _plain(given: Tensor) -> Array:
     """Numbers for machine code: contiguous, in double precision."""
     return np.ascontiguousarray(given.detach().numpy(), dtype=np.float64)
-
-
-def _levels(state: Tensor, heights: Sequence[Tensor | float] = ()) -> Array:
-    """(n, k) m from k heights of surfaces, each in m or (n,), for n states."""
-    return motion.levels(len(state), [h.numpy() if isinstance(h, Tensor) else h for h in heights])

@@ -11,12 +11,11 @@ import math
 import torch
 from torch import Tensor
 
-from ballfg.arrays import Array
 from ballfg.dynamics.compiled import motion
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion import by_machine_code, limits
 from ballfg.dynamics.motion.flight_step import rk4_step
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian, followed, is_plain
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian, followed
 from ballfg.state import Z
 
 
@@ -125,10 +124,6 @@ def fly_through(
     Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s. NaN in rows in which a contact
         never comes; they have no part in any gradient.
     """
-    if not followed(state, dt, *heights):
-        functions = motion.functions_of(model)
-        if functions is not None:
-            return by_machine_code.fly_through(model, functions, state, dt, heights)
     elapsed = torch.zeros_like(dt)
     lost = torch.zeros_like(dt, dtype=torch.bool)
     times = []
@@ -153,10 +148,6 @@ def fly_through_jacobian(
     Args: as for `fly_through`.
     Returns: state after dt (n, 9), contact times (n, k) s, Jacobian (n, 9, 9); detached from any graph.
     """
-    if is_plain(state):
-        functions = motion.functions_of(model)
-        if functions is not None:
-            return by_machine_code.fly_through_jacobian(model, functions, state, dt, heights)
     state = state.detach()
     jacobian = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device).expand(*state.shape, -1)
     elapsed = torch.zeros_like(dt)
@@ -192,15 +183,8 @@ def _flow_rate(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
 
 def gap_jacobian(model: BallModel, state: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
     """Gaps (n,) m between balls in states (n, 9) and surfaces at heights in m or (n,), and their derivatives (n, 9)."""
-    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        found = motion.Moving(model, functions, state.detach().numpy(), state.shape[-1]).gaps(_numbers(height))
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
     leaf = state.detach().requires_grad_(True)
     with torch.enable_grad():
         gap = model.gap(leaf, height)
         (gradient,) = torch.autograd.grad(gap.sum(), leaf)
     return gap.detach(), gradient
-
-
-def _numbers(height: Tensor | float) -> Array | float:
-    return height.numpy() if isinstance(height, Tensor) else height

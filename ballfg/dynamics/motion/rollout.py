@@ -23,7 +23,7 @@ from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion import by_machine_code
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.flight_step import rk4_step
-from ballfg.dynamics.motion.integrate import batch_jacobian, fly, followed, is_plain
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly, followed
 from ballfg.dynamics.motion.limits import (
     END_STEPS,
     LONGEST_MOTION,
@@ -66,8 +66,6 @@ def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) ->
 
 def roll_jacobian(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> tuple[Tensor, Tensor]:
     """`roll` of states (n, 9) over dt (n,) s, and its derivative (n, 9, 9) by the state; both detached."""
-    if is_plain(state) and (functions := motion.functions_of(model)) is not None:
-        return by_machine_code.roll_jacobian(model, functions, state, dt, height)
     return batch_jacobian(lambda at: roll(model, at, dt, height), state)
 
 

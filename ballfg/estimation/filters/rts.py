@@ -5,12 +5,11 @@ Source: H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of l
 """
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.dynamics.motion.arrays import fly_jacobian
 from ballfg.estimation.observations.innovation import leave_position_out
 from ballfg.estimation.segmentation.result import Contact, Quality
 from ballfg.factors.batch import Rows
@@ -105,13 +104,12 @@ def fly_back(
     mean, covariance = known
     width = mean.shape[1] - fading[1].shape[1]
     for k in range(start - 1, -1, -1):
-        state, dt = torch.from_numpy(mean[k + 1 : k + 2, :width]), torch.from_numpy(times[k : k + 1] - times[k + 1])
-        after, jacobian = fly_jacobian(model, state, dt)
+        after, jacobian = fly_jacobian(model, mean[k + 1 : k + 2, :width], times[k : k + 1] - times[k + 1])
         F = np.diag(np.full(len(mean[k]), fading[0][k]))
-        F[:width, :width] = jacobian[0].numpy()
+        F[:width, :width] = jacobian[0]
         widened = covariance[k + 1].copy()
         widened[:STATE_DIM, :STATE_DIM] += noise[k]
-        mean[k, :width], mean[k, width:] = after[0].numpy(), fading[0][k] * mean[k + 1, width:]
+        mean[k, :width], mean[k, width:] = after[0], fading[0][k] * mean[k + 1, width:]
         covariance[k] = F @ widened @ F.T
         covariance[k, width:, width:] += np.diag(fading[1][k] ** 2)
         if not (np.isfinite(mean[k]).all() and np.isfinite(covariance[k]).all()):  # drag accelerates back in time

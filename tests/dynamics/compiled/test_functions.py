@@ -19,10 +19,11 @@ from ballfg.dynamics.domain import Domain
 from ballfg.dynamics.effect import Coefficient, FlightEffect
 from ballfg.dynamics.effects.registry import GENERIC, LEARNED
 from ballfg.dynamics.model import substitute
-from ballfg.dynamics.motion.by_machine_code import fly_jacobian, fly_through_jacobian
+from ballfg.dynamics.motion.by_machine_code import fly_jacobian
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.estimation.segmentation.physics import physics_of
+from tests.dynamics.in_tensors import fly_through_jacobian
 
 MOTION = {name: effect for name, effect in {**EFFECTS, **GENERIC, **LEARNED}.items() if effect.kind != "measurement"}
 
@@ -54,7 +55,7 @@ def agree(model) -> None:
     right = torch.autograd.functional.jacobian(lambda x: fly(model, x, dt).sum(0), state).transpose(0, 1)
     torch.testing.assert_close(jacobian, right, rtol=1e-10, atol=1e-10)
     dt = torch.full((12,), 0.15, dtype=torch.float64)
-    after, times, jacobian = fly_through_jacobian(model, known, state, dt, (0.76,))
+    after, times, jacobian = fly_through_jacobian(model, state, dt, (0.76,))
     whole, when = fly_through(model, state, dt, (0.76,))
     torch.testing.assert_close(times, when, rtol=1e-10, atol=1e-12)
     torch.testing.assert_close(after, whole, rtol=1e-10, atol=1e-10)

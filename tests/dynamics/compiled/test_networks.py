@@ -15,11 +15,12 @@ from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.motion import functions_of
 from ballfg.dynamics.compiled.translation.arrays import narrowest
 from ballfg.dynamics.compiled.translation.trace import trace
-from ballfg.dynamics.motion.by_machine_code import fly_jacobian, fly_through_jacobian
+from ballfg.dynamics.motion.by_machine_code import fly_jacobian
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.networks.fading import Fading
 from tests.dynamics.compiled.test_functions import agree, states
+from tests.dynamics.in_tensors import fly_through_jacobian
 from tests.small_networks import SMALL
 
 KINDS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")
@@ -103,7 +104,7 @@ def test_coefficients_that_travel_with_the_state_of_a_learned_model(made) -> Non
     torch.testing.assert_close(after, fly(model, rows, dt), rtol=1e-12, atol=1e-12)
     right = torch.autograd.functional.jacobian(lambda x: fly(model, x, dt).sum(0), rows).transpose(0, 1)
     torch.testing.assert_close(jacobian, right, rtol=1e-10, atol=1e-10)
-    after, _, _ = fly_through_jacobian(model, known, rows, dt, (0.76,))
+    after, _, _ = fly_through_jacobian(model, rows, dt, (0.76,))
     torch.testing.assert_close(after, fly_through(model, rows, dt, (0.76,))[0], rtol=1e-10, atol=1e-10)
 
 

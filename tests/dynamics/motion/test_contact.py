@@ -13,6 +13,10 @@ from ballfg.dynamics.motion.contact import _newton_step, _scan, contact_time, fl
 from ballfg.dynamics.motion.flight_step import derivative
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly
 from ballfg.dynamics.motion.limits import LONGEST_FALL, MAX_STEP
+from tests.dynamics import in_tensors
+
+ROUTES = (fly_through_jacobian, in_tensors.fly_through_jacobian)
+both_routes = pytest.mark.parametrize("through", ROUTES, ids=["torch", "arrays"])
 
 R = 0.02
 
@@ -157,9 +161,10 @@ def test_one_lost_row_leaves_the_others_alone(model):
     assert by_drag.isfinite().all()
     alone, _ = fly_through(model, state[:1], dt[:1], (0.0,))
     torch.testing.assert_close(after[:1], alone)
-    after, times, jacobian = fly_through_jacobian(model, state, dt, (0.0,))
-    assert times[1].isnan().all()
-    assert jacobian[0].isfinite().all()
+    for through in ROUTES:
+        after, times, jacobian = through(model, state, dt, (0.0,))
+        assert times[1].isnan().all()
+        assert jacobian[0].isfinite().all()
 
 
 def test_gradient_of_the_contact_time_by_hand(build):
@@ -175,7 +180,8 @@ def test_gradient_of_the_contact_time_by_hand(build):
     assert by_g.item() == pytest.approx(-(t**2) / (2 * impact_speed), rel=1e-12)
 
 
-def test_saltation_formula(model, states):
+@both_routes
+def test_saltation_formula(model, states, through):
     """At dt = tau the Jacobian is S F, with S = D + (f+ - D f-) e_z^T / vz-: D of the impact, f the rates."""
     state = states(10)
     with torch.no_grad():
@@ -187,18 +193,19 @@ def test_saltation_formula(model, states):
     row[0, 2] = 1.0
     saltation = impact + (f_after - impact @ f_before) @ row / before[:, 5, None, None]
     _, flight = batch_jacobian(lambda s: fly(model, s, tau), state)
-    _, _, jacobian = fly_through_jacobian(model, state, tau, (0.0,))
+    _, _, jacobian = through(model, state, tau, (0.0,))
     # the Jacobian is that of the Runge-Kutta steps to the contact, whose rate there is the true one but for their error
     torch.testing.assert_close(jacobian, saltation @ flight, rtol=1e-4, atol=1e-5)
 
 
+@both_routes
 @pytest.mark.parametrize("contacts", [0, 1, 2])
-def test_jacobian_by_three_routes(any_model, states, differences, contacts):
+def test_jacobian_by_three_routes(any_model, states, differences, contacts, through):
     state = states(6)
     state[:, 2] -= 0.15
     dt = torch.linspace(0.05, 0.15, 6, dtype=torch.float64) + 0.3 * contacts  # contacts fall in and outside
     heights = (0.0,) * contacts
-    after, times, jacobian = fly_through_jacobian(any_model, state, dt, heights)
+    after, times, jacobian = through(any_model, state, dt, heights)
     value, graph_times = fly_through(any_model, state, dt, heights)
     torch.testing.assert_close(after, value.detach(), rtol=0, atol=1e-10)
     torch.testing.assert_close(times, graph_times.detach(), rtol=0, atol=1e-11)
@@ -214,13 +221,14 @@ def test_jacobian_by_three_routes(any_model, states, differences, contacts):
     torch.testing.assert_close(by_autograd, by_differences, rtol=2e-6, atol=2e-7)
 
 
-def test_jacobian_within_one_short_step_is_exact(any_model, states, differences):
+@both_routes
+def test_jacobian_within_one_short_step_is_exact(any_model, states, differences, through):
     """In an interval of a camera's frame, as estimators use it: 1e-6 relative and far better."""
     state = states(20)
     with torch.no_grad():
         state = fly(any_model, state, contact_time(any_model, state, 0.0) - 0.005)
     dt = torch.full((20,), 0.0083, dtype=torch.float64)
-    _, times, jacobian = fly_through_jacobian(any_model, state, dt, (0.0,))
+    _, times, jacobian = through(any_model, state, dt, (0.0,))
     torch.testing.assert_close(times[:, 0], torch.full((20,), 0.005, dtype=torch.float64), rtol=0, atol=1e-9)
     numeric = differences(lambda s: fly_through(any_model, s, dt, (0.0,))[0], state)
     torch.testing.assert_close(jacobian, numeric, rtol=1e-7, atol=1e-7)
@@ -231,17 +239,17 @@ def test_heights_that_differ_and_contacts_outside_the_interval(model, states):
     state = states(5)
     with torch.no_grad():
         tau = contact_time(model, state, 0.0)
-        reference, _ = fly_through(model, state, tau + 0.01, (0.0,))
+        reference, _ = in_tensors.fly_through(model, state, tau + 0.01, (0.0,))
         late = fly(model, state, tau + 0.004)  # already below the surface
-        after, times = fly_through(model, late, torch.full((5,), 0.006, dtype=torch.float64), (0.0,))
+        after, times = in_tensors.fly_through(model, late, torch.full((5,), 0.006, dtype=torch.float64), (0.0,))
         torch.testing.assert_close(after, reference, rtol=0, atol=1e-7)
         torch.testing.assert_close(times[:, 0], torch.full((5,), -0.004, dtype=torch.float64), rtol=0, atol=1e-8)
-        early, _ = fly_through(model, state, tau - 0.003, (0.0,))
+        early, _ = in_tensors.fly_through(model, state, tau - 0.003, (0.0,))
         bounced = model.after_bounce(fly(model, state, tau))
         backwards = fly(model, bounced, torch.full((5,), -0.003, dtype=torch.float64))
         torch.testing.assert_close(early, backwards, rtol=0, atol=1e-12)
         floor = torch.full((5,), -0.5, dtype=torch.float64)
-        _, twice = fly_through(model, state, tau + 1.0, (0.0, floor))
+        _, twice = in_tensors.fly_through(model, state, tau + 1.0, (0.0, floor))
     assert bool((twice[:, 1] > twice[:, 0]).all())
 
 
@@ -319,13 +327,14 @@ def test_a_named_contact_far_from_its_interval_is_none(build):
     model = build(gravity={"g": 10.0}, restitution={"e": 0.9})
     far = rows((0, 0, R + 0.8, 1, 0, 0, 0, 0, 0))  # touches after 0.4 s
     dt = torch.tensor([0.09, 0.11], dtype=torch.float64)
-    for flow in (fly_through, fly_through_jacobian):
+    for flow in (fly_through, in_tensors.fly_through, *ROUTES):
         times = flow(model, far.expand(2, 9), dt, (0.0,))[1]
         assert times[0].isnan().all()
         assert times[1].item() == pytest.approx(0.4, abs=1e-12)
 
 
-def test_empty_batch(model):
+@both_routes
+def test_empty_batch(model, through):
     nothing = torch.zeros((0, 9), dtype=torch.float64)
-    after, times, jacobian = fly_through_jacobian(model, nothing, nothing[:, 0], (0.0,))
+    after, times, jacobian = through(model, nothing, nothing[:, 0], (0.0,))
     assert (after.shape, times.shape, jacobian.shape) == ((0, 9), (0, 1), (0, 9, 9))

@@ -9,14 +9,15 @@ import torch
 from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import ROLLING_RESISTANCE, SOFT_SLIP, STANDARD_GRAVITY
-from ballfg.dynamics.motion.arrays import advance_jacobian
+from ballfg.dynamics.motion.arrays import advance_jacobian, roll_jacobian
 from ballfg.dynamics.motion.integrate import batch_jacobian
-from ballfg.dynamics.motion.rollout import advance, roll, roll_jacobian
+from ballfg.dynamics.motion.rollout import advance, roll
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import plane_crossing
 from ballfg.prediction.propagate import Propagator
 from ballfg.prediction.state import BallState, World
+from tests.dynamics.in_tensors import in_tensors
 
 R = 0.02
 EDGED = Surfaces(0.0, -0.5, (-0.3, 0.3, -0.3, 0.3))
@@ -61,9 +62,10 @@ def test_motions_that_end_on_a_surface_are_those_of_torch(ball: str, surfaces: S
 def test_rolling_is_that_of_torch(every_effect) -> None:
     model = AugmentedModel(every_effect, ("flight.drag.k", "bounce.table_height.offset"))
     start, dt = balls(model, 12), torch.linspace(0.0, 0.07, 12, dtype=torch.float64)
-    for height in (0.1, torch.linspace(-0.2, 0.2, 12, dtype=torch.float64)):
+    for height in (torch.full_like(dt, 0.1), torch.linspace(-0.2, 0.2, 12, dtype=torch.float64)):
         after, jacobian = batch_jacobian(lambda at, height=height: roll(model, at, dt, height), start)
-        for got, want in zip(roll_jacobian(model, start, dt, height), (after, jacobian), strict=True):
+        rolled = in_tensors(roll_jacobian, model, start, dt, height)
+        for got, want in zip(rolled, (after, jacobian), strict=True):
             close(got, want)
         with torch.no_grad():
             close(roll(model, start, dt, height), after)

@@ -9,12 +9,13 @@ from ballfg.dynamics import AnalyticModel, Architecture, Surfaces, build, nomina
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.model import substitute, take_rows
-from ballfg.dynamics.motion.contact import contact_time, fly_through, fly_through_jacobian
+from ballfg.dynamics.motion.contact import contact_time, fly_through
 from ballfg.dynamics.motion.flight_step import rate_jacobian
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian
 from ballfg.dynamics.networks.learned import HIGHEST_RESTITUTION, START_RESTITUTION
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.segmentation.physics import physics_of
+from tests.dynamics.in_tensors import fly_through_jacobian
 from tests.small_networks import SMALL
 
 pytestmark = pytest.mark.usefixtures("networks_in_torch")
