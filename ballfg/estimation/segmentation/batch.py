@@ -1,19 +1,17 @@
-"""Segments a whole track by a forward pass over all samples, and assembles the events of a chain."""
+"""Assembles the segmentation of a track from the events of a chain."""
 
 import math
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index, plain
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNTS, NOTHING, ONE, REAL, TWO
-from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Contact, Event, EventKind, Quality, Rest, Segmentation
-from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.state import Z
 
@@ -160,38 +158,14 @@ def _fit_velocity(
         velocity[axis] = moved / scatter
 
 
-def segment(
-    times: ArrayLike,
-    positions: ArrayLike,
-    sigma: ArrayLike,
-    *,
-    surfaces: Surfaces,
-    physics: SegmentationPhysics | None = None,
-    settings: SegmentationSettings | None = None,
-) -> Segmentation:
-    """Finds contacts, hits, rests and bad samples of one track.
-
-    Args:
-        times: (n,) s, strictly increasing.  positions: (n, 3) m, world frame, z up.
-        sigma: (3,) or (n, 3) m, standard deviation of each coordinate. Half the true noise makes false shifts.
-            `estimate_position_noise` estimates it from the data.
-        surfaces: table and floor; the ball's centre bounces a radius and the physics' offset above them.
-        physics: of the ball, see `physics_of`; None: table tennis.
-        settings: noise model and prices of events; None: defaults.
-    Returns: the best explanation; n = 0 gives an empty one.
-    Raises: ValueError: if shapes disagree, something is not finite, or times do not increase.
-    Source: docs/derivations/segmentation.md.
-    """
-    t, x, s = _checked(times, positions, sigma)
-    physics, settings = physics or SegmentationPhysics(), settings or SegmentationSettings()
-    found = Segmenter(surfaces, physics, settings).push_all(t, x, s)
-    return assembled((*found.final, *found.pending), t, x, physics, settings)
-
-
 def assembled(
     events: Sequence[Event], times: Array, positions: Array, ball: SegmentationPhysics, settings: SegmentationSettings
 ) -> Segmentation:
-    """The segmentation by a chain of events, with hits at contacts; times (n,) s and positions (n, 3) m."""
+    """The segmentation by a chain of events, with hits at contacts.
+
+    Args: times: (n,) s.  positions: (n, 3) m.  ball: of the track.  settings: of the forward pass.
+    Source: docs/derivations/segmentation.md.
+    """
     n = len(times)
     met = (e for e in events if e.kind is EventKind.CONTACT)
     contacts = [Contact(e.index, e.time, e.height) for e in met if e.height is not None]
@@ -200,25 +174,3 @@ def assembled(
     restarts = np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64)
     hit = np.array(sorted(hits), dtype=np.int64)
     return Segmentation(tuple(contacts), hit, restarts, tuple(rests_of(events, n)), quality)
-
-
-def _checked(times: ArrayLike, positions: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array, Array]:
-    t = np.asarray(times, dtype=np.float64)
-    x = np.asarray(positions, dtype=np.float64)
-    s = np.asarray(sigma, dtype=np.float64)
-    if t.ndim != 1 or x.shape != (len(t), 3):
-        raise ValueError(
-            f"times must be (n,) and positions (n, 3); got {t.shape} and {x.shape}. Pass one row a sample."
-        )
-    if s.shape not in ((3,), x.shape):
-        raise ValueError(f"sigma must be (3,) or {x.shape}; got {s.shape}. Give one standard deviation a coordinate.")
-    if not (s > 0).all():
-        raise ValueError(f"sigma must be positive; got {s.min():g}. Use estimate_position_noise where none is known.")
-    good = np.isfinite(t) & (np.diff(t, prepend=-np.inf) > 0.0)
-    if not good.all():
-        raise ValueError(f"times must be finite and increase; got {t[~good][0]} s. Sort the samples.")
-    for name, array in (("positions", x), ("sigma", s)):
-        if not np.isfinite(array).all():
-            wrong = array[~np.isfinite(array)][0]
-            raise ValueError(f"{name} must be finite numbers in m; got {wrong}. Drop samples without a position.")
-    return t, x, np.broadcast_to(s, x.shape)

@@ -16,10 +16,10 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.plausible import LEAST_POSITION_SIGMA, measured_only, plausible
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.segmentation.batch import segment
+from ballfg.estimation.segmentation.batch import assembled
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Segmentation
-from ballfg.estimation.segmentation.segmenter import USUAL
+from ballfg.estimation.segmentation.segmenter import USUAL, Segmenter
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.sides.monitor import widened_near_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
@@ -157,8 +157,9 @@ class Smoother(Estimator):
         settings, prices = self.settings.for_track(track), replace(USUAL, longest_gap=longest_gap)
         white = sample_sigmas(settings, len(track), track.sigmas)
         sigma = total_sigmas(settings, white, partial(window_velocities, track.times, track.positions))
-        ball, surfaces = physics_of(self.model), self.surfaces
-        found = segment(track.times, track.positions, sigma, surfaces=surfaces, physics=ball, settings=prices)
+        ball = physics_of(self.model)
+        passed = Segmenter(self.surfaces, ball, prices).push_all(track.times, track.positions, sigma)
+        found = assembled((*passed.final, *passed.pending), track.times, track.positions, ball, prices)
         found = found if self.settings.find_events else found.only_contacts()
         hops = self.low_hops(track, found)
         return counted(found, hops, track.times), hops

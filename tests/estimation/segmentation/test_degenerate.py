@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.explain import _rarity
 from ballfg.estimation.segmentation.result import Quality
+from tests.estimation.segmentation.whole_tracks import segment
 
 TABLE = Surfaces(0.75)
 T = np.arange(60) / 180
@@ -14,7 +14,7 @@ PARABOLA = np.stack([0 * T, 3 * T, 1 + 2 * T - 4.9 * T**2], axis=1)
 
 
 def found(times, positions, sigma=0.0015, surfaces=TABLE):
-    result = segment(times, positions, np.full(3, sigma), surfaces=surfaces)
+    result = segment(times, positions, sigma, surfaces=surfaces)
     n = len(times)
     assert result.quality.shape == (n,)
     assert all(0 <= c.interval < n - 1 and np.isfinite(c.time) for c in result.contacts)
@@ -150,21 +150,6 @@ def test_absurd_noise(sigma):
 
 def test_below_every_surface():
     found(T, PARABOLA - [0, 0, 5.0], surfaces=Surfaces.table_tennis(0.75))
-
-
-@pytest.mark.parametrize(
-    ("times", "positions", "sigma", "message"),
-    [
-        (T, PARABOLA[:5], np.ones(3), r"positions \(n, 3\); got \(60,\) and \(5, 3\)"),
-        (T, PARABOLA, np.ones(2), r"sigma must be \(3,\) or \(60, 3\); got \(2,\)"),
-        (T, PARABOLA, np.zeros(3), r"sigma must be positive; got 0"),
-        (T[::-1], PARABOLA, np.ones(3), r"times must be finite and increase; got 0.32"),
-        (T, PARABOLA * np.nan, np.ones(3), r"positions must be finite numbers"),
-    ],
-)
-def test_bad_input_is_named(times, positions, sigma, message):
-    with pytest.raises(ValueError, match=message):
-        segment(times, positions, sigma, surfaces=TABLE)
 
 
 def test_an_event_costs_what_chance_says_and_no_more_for_closer_stamps() -> None:

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Quality
+from tests.estimation.segmentation.whole_tracks import segment
 
 PHYSICS = physics_of(nominal_model())
 SIGMA = 0.0015
 
 
 def segmented(truth, times, positions, sigma=SIGMA):
-    return segment(times, positions, [sigma] * 3, surfaces=Surfaces(0.75), physics=PHYSICS)
+    return segment(times, positions, sigma, surfaces=Surfaces(0.75), physics=PHYSICS)
 
 
 def intervals(times, stamps):

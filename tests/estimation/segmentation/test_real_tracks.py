@@ -5,10 +5,10 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.segmentation.result import Quality
 from ballfg.tracks import read_dataset
+from tests.estimation.segmentation.whole_tracks import segment
 from tests.places import DATA
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured tracks at {DATA}; set BALLFG_DATA")

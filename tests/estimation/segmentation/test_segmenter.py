@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
 from ballfg.estimation.segmentation.result import Event, EventKind
 from ballfg.estimation.segmentation.segmenter import Segmenter
 from ballfg.estimation.segmentation.settings import SegmentationSettings
+from tests.estimation.segmentation.whole_tracks import segment
 
 PHYSICS = physics_of(nominal_model())
 SIGMA = np.full(3, 0.0015)

@@ -7,8 +7,8 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.model_file import model_from_dict
-from ballfg.estimation.segmentation.batch import segment
 from ballfg.estimation.segmentation.physics import physics_of
+from tests.estimation.segmentation.whole_tracks import segment
 
 EDGED = Surfaces(0.75, 0.0, (-0.76, 0.76, -1.37, 1.37))
 UNKNOWN = Surfaces(0.75, 0.0)
@@ -23,7 +23,7 @@ def see(make_flight):
         model = model or nominal_model()
         truth = make_flight(model, start, times, true, hits)
         positions = truth.measured(np.random.default_rng(0), sigma)
-        return truth, segment(times, positions, [sigma] * 3, surfaces=known, physics=physics_of(model))
+        return truth, segment(times, positions, sigma, surfaces=known, physics=physics_of(model))
 
     return run
 
@@ -70,9 +70,7 @@ def test_a_floor_may_be_duller_than_the_table(make_flight, match):
     dull = model_from_dict({"flight": {"gravity": {}, "drag": {}}, "bounce": {"restitution": {"e": 0.6}}})
     truth = make_flight(dull, [0, 1, 1.1, 0, 3, 1, 0, 0, 0], TIMES[:180], EDGED)
     positions = truth.measured(np.random.default_rng(0), 0.0015)
-    found = segment(
-        TIMES[:180], positions, [0.0015] * 3, surfaces=EDGED, physics=replace(physics_of(dull), restitution=0.9)
-    )
+    found = segment(TIMES[:180], positions, 0.0015, surfaces=EDGED, physics=replace(physics_of(dull), restitution=0.9))
     assert len(truth.contacts) >= 1
     check_contacts(match, found, truth)
     assert len(found.hits) == 0
@@ -128,7 +126,7 @@ def test_a_resting_ball_is_hit(make_flight):
     rng = np.random.default_rng(0)
     times = np.concatenate([still.times, still.times[-1] + 1 / 180 + flying.times])
     positions = np.concatenate([still.measured(rng), flying.measured(rng)])
-    found = segment(times, positions, [0.0015] * 3, surfaces=surfaces, physics=physics_of(nominal_model()))
+    found = segment(times, positions, 0.0015, surfaces=surfaces, physics=physics_of(nominal_model()))
     assert [(r.first, r.height) for r in found.rests] == [(0, 0.75)]
     assert len(found.hits) == 1
     assert abs(int(found.hits[0]) - 99) <= 2
