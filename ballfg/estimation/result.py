@@ -260,6 +260,14 @@ class Estimate:
         return picture(self)
 
 
+def opening(estimate: Estimate, count: int) -> Estimate:
+    """The first states of an estimate, so many, and the events up to the next one."""
+    by_sample = ("times", "states", "covariances", "other_sides", "cross_covariances", "quality")
+    contacts = tuple(contact for contact in estimate.contacts if contact.interval < count)
+    first: dict[str, Any] = {name: getattr(estimate, name)[:count] for name in by_sample}
+    return replace(estimate, **first, contacts=contacts, hits=estimate.hits[estimate.hits < count])
+
+
 def joined(
     whole: Estimate, times: Array, parts: Iterable[Estimate], status_after: Callable[[Status, Status], Status]
 ) -> Estimate:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from ballfg.estimation.online.events import EventTracker
 from ballfg.estimation.online.state import Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.plausible import measured_only
-from ballfg.estimation.result import Estimate, Status, joined
+from ballfg.estimation.result import Estimate, Status, joined, opening
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.settle import Earlier
 from ballfg.estimation.smoother.smoother import Smoother
@@ -35,7 +34,7 @@ class Leaving:
 
     def take(self, window: StreamWindow, events: EventTracker, count: int) -> None:
         """Keeps the oldest states of the window, so many, as its minimum has them."""
-        self.parts.append(_oldest(self._minimum(window, events), count))
+        self.parts.append(opening(self._minimum(window, events), count))
 
     def lose(self, samples: Sequence[Sample], p: int) -> None:
         """Keeps the states of samples as they are known without their window, which could not be solved.
@@ -83,14 +82,6 @@ class Leaving:
         if not first:  # what has left the window is not known well enough
             problem, settled = self.smoother.bridged(problem, settled)
         return self.smoother.result(problem, settled, begins=not first)
-
-
-def _oldest(estimate: Estimate, count: int) -> Estimate:
-    """The first states of an estimate, so many, and the events up to the next one."""
-    by_sample = ("times", "states", "covariances", "other_sides", "cross_covariances", "quality")
-    contacts = tuple(contact for contact in estimate.contacts if contact.interval < count)
-    first: dict[str, Any] = {name: getattr(estimate, name)[:count] for name in by_sample}
-    return replace(estimate, **first, contacts=contacts, hits=estimate.hits[estimate.hits < count])
 
 
 def unknown(sample: Sample, settings: Settings) -> tuple[Array, Array]:

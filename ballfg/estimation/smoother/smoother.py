@@ -335,7 +335,7 @@ class Smoother(Estimator):
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = problem.judged(estimate)
-        rival = rival_note(solution, estimate.covariances[0])
+        rival = rival_note(solution.rival, values.states[0], estimate.covariances[0])
         estimate = replace(estimate, notes=estimate.notes + rival) if rival else estimate
         return widened_near_contacts(estimate, problem.ball, segmentation.restarts)
 

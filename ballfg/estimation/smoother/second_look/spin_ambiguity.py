@@ -71,15 +71,15 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
     return solution
 
 
-def rival_note(solution: Solution, covariance: Array) -> tuple[str, ...]:
-    """A note on another spin that explains the track nearly as well, unless the first covariance includes it."""
-    if solution.rival is None:
+def rival_note(rival: Array | None, state: Array, covariance: Array) -> tuple[str, ...]:
+    """A note on another first spin that explains the track nearly as well, unless the first covariance includes it."""
+    if rival is None:
         return ()
-    spin = solution.minimum.values.states[0, SPIN]
-    apart = solution.rival - spin
+    spin = state[SPIN]
+    apart = rival - spin
     if apart @ np.linalg.solve(covariance[SPIN, SPIN], apart) < RIVAL_APART**2:
         return ()
-    one, other = ("({:.0f}, {:.0f}, {:.0f})".format(*value) for value in (spin, solution.rival))
+    one, other = ("({:.0f}, {:.0f}, {:.0f})".format(*value) for value in (spin, rival))
     return (f"two spins explain the track nearly as well: {one} and {other} rad/s at its start; a spin label decides",)
 
 
