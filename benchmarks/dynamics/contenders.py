@@ -56,7 +56,6 @@ class GraphContender:
     """A dynamics model in the factor graph: smooth the observed part, predict the rest.
 
     Attributes:
-        name: the method in `results.json`.
         model: the dynamics.  surfaces: on what it bounces.  settings: of the smoother.
         label: gives a track the spin label that its launcher settings mean, if the method knows that.
         onward: predict as `ballfg predict` does: the observed part is the smoothed one, the rest is rolled out from
@@ -66,7 +65,6 @@ class GraphContender:
         failures: number of estimates that did not converge so far.
     """
 
-    name: str
     model: BallModel
     surfaces: Surfaces
     settings: Settings
@@ -122,7 +120,7 @@ def nominal_contender(job: Job, task: Task) -> GraphContender:
     """The nominal analytic model, as before any data, with the known spins of launcher settings."""
     label = as_it_is if task.launcher is None else task.launcher.labelled
     model = nominal_model(task.info.ball)
-    return GraphContender(job.method, model, task.surfaces, task.settings, label, job.measured)
+    return GraphContender(model, task.surfaces, task.settings, label, job.measured)
 
 
 def adapting_contender(job: Job, task: Task) -> GraphContender:

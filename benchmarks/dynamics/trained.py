@@ -89,7 +89,6 @@ def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
 class SequenceContender:
     """A sequence model: predicts what follows the observed part; as `GraphContender`."""
 
-    name: str
     parameter_count: int
     training_seconds: float
     predictor: SequencePredictor
@@ -117,7 +116,7 @@ def trained_contender(job: Job, task: Task) -> GraphContender | SequenceContende
     seconds = sum(epoch.seconds for epoch in read_metrics(folder / METRICS))
     if config.kind in SEQUENCES:
         predictor = SequencePredictor.load(folder / FOLDER)
-        return SequenceContender(job.method, predictor.parameter_count, seconds, predictor)
+        return SequenceContender(predictor.parameter_count, seconds, predictor)
     model = load_model(folder / MODEL, radius=task.info.ball.radius)
     trained = model.trained
     assert trained is not None
@@ -131,7 +130,6 @@ def trained_contender(job: Job, task: Task) -> GraphContender | SequenceContende
         coefficients={},
     )
     return GraphContender(
-        name=job.method,
         model=model,
         surfaces=task.surfaces,
         settings=settings,

@@ -125,30 +125,18 @@ class LinearFilter:
             measured: (t, n, 3, 3) m^2, the result of `measured`.
         Raises: numpy.linalg.LinAlgError: the covariance of an innovation is not positive definite.
         """
-        return self.run_with(self.variances(noise, measured), noise.memory_time)
-
-    def variances(self, noise: Noise, measured: Array) -> Variances:
-        """The variances of all sources of error under some noise; arguments as those of `run`."""
-        tracks, count = self.tracks, self.count
-        prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
-        process, memory = (np.tile(x, (count // len(x), 1)) for x in (noise.process**2, noise.memory))
-        return Variances(process, memory, prior, measured)
-
-    def run_with(self, variances: Variances, memory_time: Array) -> Filtered:
-        """The filter for the variances of all sources of error.
-
-        Args: variances: of all sources.  memory_time: (r,) s.
-        Raises: numpy.linalg.LinAlgError: as `run`.
-        """
         tracks, shape, width = self.tracks, (self.count, self.samples), self.width
-        decays = np.exp(-np.diff(tracks.times, axis=1) / memory_time[:, None])
-        prior = np.concatenate((variances.prior, variances.memory[:, : self.biases]), axis=1)
+        known = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
+        process, memory = (np.tile(x, (self.count // len(x), 1)) for x in (noise.process**2, noise.memory))
+        decays = np.exp(-np.diff(tracks.times, axis=1) / noise.memory_time[:, None])
+        prior = np.concatenate((known, memory[:, : self.biases]), axis=1)
         sizes = (width,), (width, width), (width, 3), (3, 3), (3,), ()
         made, nll = [np.empty(shape + size) for size in sizes], np.empty(self.count)
         moved = tracks.transitions, tracks.offsets, tracks.kicks
-        given = plain(variances.process), decays, plain(variances.memory), plain(variances.measured)
+        given = plain(process), decays, plain(memory), plain(measured)
         if not filter_tracks(*moved, *given, tracks.errors, self.seen, self.first, prior, *made, nll):
             raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+        variances = Variances(process, memory, known, measured)
         return Filtered(made[0], made[1], nll, self._scored, variances, decays, tuple(made[2:]))
 
     def slopes(
