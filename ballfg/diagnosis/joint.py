@@ -22,7 +22,7 @@ from ballfg.diagnosis.fit.patterns import DRIFT
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.generic_test import LabelCheck
-from ballfg.diagnosis.hypotheses.hypothesis import effects_of, has_effect, with_effects, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
 from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test
@@ -162,7 +162,7 @@ def _first_fit(model: AnalyticModel, halves: Holdout, way: Grouping) -> Fit:
     model = copy.deepcopy(model).requires_grad_(False)
     problem = Problem(model, reachable(model, halves.search), declared_free(model))
     free, deviations = dict(problem.free), dict[str, Deviation]()
-    for effect in (e for e in effects_of(model) if e.kind != "flight"):
+    for effect in (e for e in model.effects if e.kind != "flight"):
         names = [c.name for c in effect.coefficients if f"{effect.kind}.{effect.name}.{c.name}" in problem.free]
         varying = Varying.of(type(effect), names, way)
         free |= {name: replace(c, sigma=c.sigma / LOOSE) for name, c in varying.free().items()}

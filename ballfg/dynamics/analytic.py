@@ -43,10 +43,14 @@ class AnalyticModel(BallModel):
         self._turning = _overriding(self.flight, FlightEffect, "spin_rate")
         self._sloping = _overriding(self.bounce, BounceEffect, "surface_slope")
 
+    @property
+    def effects(self) -> list[Effect]:
+        """All effects: of flight, of bounces, of measurements."""
+        return [cast(Effect, e) for group in (self.flight, self.bounce, self.measurement) for e in group.values()]
+
     def declared_coefficients(self) -> dict[str, Coefficient]:
         """The coefficients of all effects, for instance under `flight.drag.k`."""
-        effects = [cast(Effect, e) for group in (self.flight, self.bounce, self.measurement) for e in group.values()]
-        return {f"{effect.kind}.{effect.name}.{c.name}": c for effect in effects for c in effect.coefficients}
+        return {f"{effect.kind}.{effect.name}.{c.name}": c for effect in self.effects for c in effect.coefficients}
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, in free flight."""

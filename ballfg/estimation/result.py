@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.checks import check_instance
 from ballfg.estimation.segmentation.result import Contact
+from ballfg.factors.linear.definite import joint_covariance
 from ballfg.prediction.forecast import Forecast
 from ballfg.prediction.state import BallState, World
 from ballfg.state import CORRELATIONS, SIGMA_NAMES, STATE_DIM, STATE_NAMES
@@ -164,12 +165,9 @@ class Estimate:
             index; `states` and `covariances` hold several samples.
         """
         sample = operator.index(sample)
-        joint = np.zeros((STATE_DIM + len(self.coefficients),) * 2)
-        joint[:STATE_DIM, :STATE_DIM] = self.covariances[sample]
+        joint = self.covariances[sample].copy()
         if self.coefficient_names:
-            joint[:STATE_DIM, STATE_DIM:] = self.cross_covariances[sample]
-            joint[STATE_DIM:, :STATE_DIM] = self.cross_covariances[sample].T
-            joint[STATE_DIM:, STATE_DIM:] = self.coefficient_covariance
+            joint = joint_covariance(joint, self.cross_covariances[sample], self.coefficient_covariance)
         mean = np.concatenate((self.states[sample], self.coefficients))
         other_side = self.other_sides[sample] if len(self.other_sides) else None
         return BallState(

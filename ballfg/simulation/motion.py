@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -35,8 +34,7 @@ def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> Analyti
 
     Raises: ValueError: if an effect is given twice, or changes one that the model does not have.
     """
-    groups = (declared.flight, declared.bounce, declared.measurement)
-    effects = {name: cast(Effect, effect) for group in groups for name, effect in group.items()}
+    effects = {effect.name: effect for effect in declared.effects}
     seen: set[str] = set()
     for effect in check_each("undeclared", undeclared, Effect, "Give Wind() or another one."):
         if effect.name in seen:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import COEFFICIENTS
-from ballfg.factors.linear.definite import definite, variances_positive
+from ballfg.factors.linear.definite import definite, joint_covariance, variances_positive
 from ballfg.factors.linear.elimination import Root
 from ballfg.factors.linear.substitution import covariances_of
 
@@ -33,11 +33,7 @@ class Covariances:
 
     def joint(self, state: int) -> Array:
         """(9 + b + p, 9 + b + p) of a state and its bias with the coefficients behind them."""
-        own, cross = self.states[state], self.cross[state]
-        w, size = len(own), len(own) + len(self.coefficients)
-        joint = np.empty((size, size))
-        joint[:w, :w], joint[:w, w:], joint[w:, :w], joint[w:, w:] = own, cross, cross.T, self.coefficients
-        return joint
+        return joint_covariance(self.states[state], self.cross[state], self.coefficients)
 
 
 @dataclass(frozen=True)

@@ -64,25 +64,26 @@ def whitened(vectors: Array, covariance: Array) -> Array:
     return own.reshape(shape)
 
 
+def joint_covariance(own: Array, cross: Array, shared: Array) -> Array:
+    """(..., d + p, d + p) from covariances (..., d, d) of own and (p, p) of shared numbers, and those between them."""
+    both = np.broadcast_to(shared, (*own.shape[:-2], *shared.shape))
+    return np.block([[own, cross], [cross.swapaxes(-1, -2), both]])
+
+
 def compatible(cross: Array, own: Array, shared: Array) -> Array:
     """Covariances (n, d, p) between own and shared variables, shrunk until compatible with the covariances of both.
 
     Args: cross: (n, d, p).  own: (n, d, d), positive definite.  shared: (p, p), positive definite.
     """
-    if not shared.size or _all_definite(_joint(cross, own, shared)):
+    if not shared.size or _all_definite(joint_covariance(own, cross, shared)):
         return cross
     cross = cross.copy()
     for one, mine in zip(cross, own, strict=True):
         share = FIRST_SHRINKAGE
-        while not _all_definite(_joint(one, mine, shared)):
+        while not _all_definite(joint_covariance(mine, one, shared)):
             one *= 1.0 - min(share, 1.0)
             share *= 10.0
     return cross
-
-
-def _joint(cross: Array, own: Array, shared: Array) -> Array:
-    both = np.broadcast_to(shared, (*own.shape[:-2], *shared.shape))
-    return np.block([[own, cross], [cross.swapaxes(-1, -2), both]])
 
 
 def _all_definite(symmetric: Array) -> bool:

@@ -105,12 +105,8 @@ def with_correction(
     effect = AirCorrection(**shape)
     carried = [f"{DOUBT[force]}_{k}" for force in FORCES[: 1 + labelled] for k in range(1, DOUBTS + 1)]
     effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR), **dict.fromkeys(carried, 1.0))
-    effects = [
-        copy.deepcopy(cast(Effect, one))
-        for group in (model.flight, model.bounce, model.measurement)
-        for one in group.values()
-    ]
-    corrected = AnalyticModel([*effects, effect], radius=model.radius, inertia_factor=model.inertia_factor)
+    effects = [*copy.deepcopy(model.effects), effect]
+    corrected = AnalyticModel(effects, radius=model.radius, inertia_factor=model.inertia_factor)
     return corrected, terms.T @ terms / len(terms)
 
 

@@ -79,19 +79,14 @@ class Hypothesis:
         return with_effects(model, self.effect(**{**self.shape, **absent}))
 
 
-def effects_of(model: AnalyticModel) -> list[Effect]:
-    """All effects of a model, in order."""
-    return [cast(Effect, e) for group in (model.flight, model.bounce, model.measurement) for e in group.values()]
-
-
 def has_effect(model: AnalyticModel, name: str) -> bool:
     """True if the model declares an effect."""
-    return any(effect.name == name for effect in effects_of(model))
+    return any(effect.name == name for effect in model.effects)
 
 
 def with_effects(model: AnalyticModel, *effects: Effect) -> AnalyticModel:
     """A copy of a model with further effects; its parameters are fixed (`requires_grad` is off)."""
-    return _of_effects(model, [*(copy.deepcopy(effect) for effect in effects_of(model)), *effects])
+    return _of_effects(model, [*copy.deepcopy(model.effects), *effects])
 
 
 def with_coefficients(model: AnalyticModel, values: Mapping[str, float]) -> AnalyticModel:
@@ -106,7 +101,7 @@ def with_coefficients(model: AnalyticModel, values: Mapping[str, float]) -> Anal
 
 def without_effect(model: AnalyticModel, name: str) -> AnalyticModel:
     """A copy of a model without one of its effects, and without those that need it."""
-    return _of_effects(model, [copy.deepcopy(e) for e in effects_of(model) if e.name != name and name not in e.needs])
+    return _of_effects(model, [copy.deepcopy(e) for e in model.effects if e.name != name and name not in e.needs])
 
 
 def _of_effects(model: AnalyticModel, effects: list[Effect]) -> AnalyticModel:

@@ -7,7 +7,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Rows
 from ballfg.factors.linear.covariance import Covariances
-from ballfg.factors.linear.definite import definite, variances_positive, whitened
+from ballfg.factors.linear.definite import definite, joint_covariance, variances_positive, whitened
 from ballfg.factors.linear.step import weighted
 from ballfg.state import POSITION, STATE_DIM
 
@@ -141,9 +141,7 @@ def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
     pulled = np.concatenate(jacobians, axis=-1)
     joint = covariances.states[state]
     if len(jacobians) > 1:
-        cross = covariances.cross[state]
-        both = np.broadcast_to(covariances.coefficients, (len(state), *covariances.coefficients.shape))
-        joint = np.block([[joint, cross], [cross.swapaxes(-1, -2), both]])
+        joint = joint_covariance(joint, covariances.cross[state], covariances.coefficients)
     gain = joint @ pulled.swapaxes(-1, -2)
     # a measurement that alone determines its value leaves nothing: bound C, the whitened distance goes to zero
     left = _inverse_of_rest(unit - pulled @ gain)

@@ -12,7 +12,6 @@ from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.hypotheses.hypothesis import (
     LOOSE,
     Hypothesis,
-    effects_of,
     has_effect,
     hypotheses,
     scene_of,
@@ -101,14 +100,14 @@ def test_models_are_copies(make_ball):
     larger = with_effects(model, Wind())
     assert not has_effect(model, "wind")
     assert has_effect(larger, "wind")
-    assert not {id(e) for e in effects_of(model)} & {id(e) for e in effects_of(larger)}
+    assert not {id(e) for e in model.effects} & {id(e) for e in larger.effects}
     assert not any(p.requires_grad for p in larger.parameters())
     assert WIND.added_to(larger) is larger
 
 
 def test_what_needs_an_effect_goes_with_it(make_ball):
     model = make_ball(drag_spin={}, magnus_saturation={})
-    assert {e.name for e in effects_of(without_effect(model, "drag"))} == {
+    assert {e.name for e in without_effect(model, "drag").effects} == {
         "gravity", "magnus", "restitution", "friction", "magnus_saturation",
     }  # fmt: skip
 
