@@ -40,6 +40,7 @@ def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings
             states=np.where(wrong[:, None], states, estimate.states),
             other_sides=np.where(wrong[: len(estimate.other_sides), None, None], 0.0, estimate.other_sides),
             status=status,
+            struck={},
         )
     if lost:
         coefficients = np.array(list(settings.coefficients.values()))
@@ -48,6 +49,7 @@ def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings
             coefficients=np.where(np.isfinite(estimate.coefficients), estimate.coefficients, 0.0),
             coefficient_covariance=np.diag(coefficients**2),
             status=status,
+            struck={},
         )
     covariances, shared = definite(covariances), estimate.coefficient_covariance
     shared = definite(shared) if shared.size else shared

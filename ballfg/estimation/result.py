@@ -88,6 +88,8 @@ class Estimate:
         covariances: (n, 9, 9) in the products of those units.
         other_sides: (n, 9, 9) in the same units, the share of the covariances for the chance that the ball is on the
             other side of a near contact.
+        struck: (9 + p, 9 + p) in the same units and those of the coefficients, by sample: the share of the covariance
+            of last samples that contradict the flight, for the chance that the ball was hit before them.
         status: how the estimation ended.
         innovations: whitened innovations by name of the observation, (m, dim) each. For a filter: measured minus
             predicted; for a smoother: measured minus its prediction from all other measurements. Each divided by its
@@ -136,6 +138,7 @@ class Estimate:
     notes: tuple[str, ...] = ()
     other_sides: Array = field(default_factory=lambda: np.zeros((0, 9, 9)))
     labels: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+    struck: Mapping[int, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.times)
@@ -170,8 +173,9 @@ class Estimate:
             joint = joint_covariance(joint, self.cross_covariances[sample], self.coefficient_covariance)
         mean = np.concatenate((self.states[sample], self.coefficients))
         other_side = self.other_sides[sample] if len(self.other_sides) else None
+        struck = self.struck.get(sample % len(self))
         return BallState(
-            float(self.times[sample]), mean, joint, self.coefficient_names, self.world, self.name, other_side
+            float(self.times[sample]), mean, joint, self.coefficient_names, self.world, self.name, other_side, struck
         )
 
     @classmethod

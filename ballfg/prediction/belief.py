@@ -9,7 +9,6 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
@@ -31,12 +30,14 @@ class Belief:
         time: (n,) s.
         mean: (n, 9 + p) states, then coefficients in their own units.
         covariance: (n, 9 + p, 9 + p) in the products of those units.
+        struck: (n, 9 + p, 9 + p) part of the covariance for the chance that a ball was hit just before, or None.
     """
 
     model: BallModel
     time: Array
     mean: Array
     covariance: Array
+    struck: Array | None = None
 
     def __post_init__(self) -> None:
         for name in ("time", "mean", "covariance"):
@@ -76,7 +77,7 @@ class Belief:
         joints = [_joint(state, names, prior_mean, np.array(list(prior.values()))) for state in states]
         mean = np.stack([_held(m, covariance, low, high) for m, covariance in joints])
         times = np.array([state.time for state in states])
-        return cls(bounded, times, mean, np.stack([covariance for _, covariance in joints]))
+        return cls(bounded, times, mean, np.stack([covariance for _, covariance in joints]), _struck(states, names))
 
     def within_bounds(self, states: Array) -> Array:
         """Balls whose coefficients lie within the bounds of their effects.
@@ -93,29 +94,6 @@ class Belief:
     def from_zero(self) -> Belief:
         """The belief with time counted from now, against the rounding of large stamps."""
         return replace(self, time=np.zeros_like(self.time))
-
-    @staticmethod
-    def joined(beliefs: Sequence[Belief]) -> Belief:
-        """All balls of some beliefs.
-
-        Args:
-            beliefs: one or more, of the same model.
-        """
-        return Belief(
-            beliefs[0].model,
-            np.concatenate([belief.time for belief in beliefs]),
-            np.concatenate([belief.mean for belief in beliefs]),
-            np.concatenate([belief.covariance for belief in beliefs]),
-        )
-
-    def take(self, rows: ArrayLike | slice) -> Belief:
-        """A part of the balls.
-
-        Args:
-            rows: their (m,) indices, a (n,) mask or a slice.
-        """
-        rows = rows if isinstance(rows, slice) else np.asarray(rows)
-        return replace(self, time=self.time[rows], mean=self.mean[rows], covariance=self.covariance[rows])
 
 
 def _bounds(model: BallModel, names: tuple[str, ...]) -> tuple[Array, Array]:
@@ -138,6 +116,18 @@ def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_si
     if state.other_side is not None:
         covariance[:STATE_DIM, :STATE_DIM] -= state.other_side
     return mean, (covariance + covariance.T) / 2
+
+
+def _struck(states: Sequence[BallState], names: tuple[str, ...]) -> Array | None:
+    """As of `Belief`, with all coefficients."""
+    if all(state.struck is None for state in states):
+        return None
+    found = np.zeros((len(states), STATE_DIM + len(names), STATE_DIM + len(names)))
+    for share, state in zip(found, states, strict=True):
+        if state.struck is not None:
+            own = [*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in state.coefficient_names)]
+            share[np.ix_(own, own)] = state.struck
+    return found
 
 
 def _held(mean: Array, covariance: Array, low: Array, high: Array) -> Array:

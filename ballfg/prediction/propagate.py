@@ -146,9 +146,11 @@ class Propagator:
         durations = np.diff(times, prepend=belief.time[:, None])
         if not (durations >= 0.0).all():
             raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
-        carrier = self._carrier(belief)
-        for part, elapsed in self._over(carrier, belief, durations):
-            yield carrier.mixed(part), elapsed
+        flying = belief if belief.struck is None else replace(belief, covariance=belief.covariance - belief.struck)
+        carrier = self._carrier(flying)
+        for part, elapsed in self._over(carrier, flying, durations):
+            found = carrier.mixed(part)
+            yield found if belief.struck is None else _with_struck(found, belief.struck, elapsed), elapsed
 
     def _over(self, carrier: Carrier, belief: Belief, given: Array) -> Iterator[tuple[Course, Array]]:
         """Linear beliefs after some durations (n, k) s, a few at a time, with the elapsed time (n, j) s."""
@@ -204,7 +206,7 @@ class Propagator:
         """The belief after dt (n,) s of free flight, without surfaces."""
         after, jacobian = arrays.fly_jacobian(belief.model, belief.mean, dt)
         covariance = _carried(jacobian, belief.covariance, self.noise.flight(dt))
-        return replace(belief, time=belief.time + dt, mean=after, covariance=covariance)
+        return Belief(belief.model, belief.time + dt, after, covariance)
 
     def _bounce_noise(self, model: BallModel, mean: Array, h: float, times: Sequence[float], jacobian: Array) -> Array:
         """(9, 9) covariance gathered in a step of h s with impacts at some times, s.
@@ -252,6 +254,19 @@ def _beliefs(start: Belief, course: Course, elapsed: Array) -> Iterator[Belief]:
     """The beliefs of a course, each after the time (n, k) s since the start in one column."""
     for k in range(len(course)):
         yield Belief(start.model, start.time + elapsed[:, k], course.mean[k], course.covariance[k])
+
+
+def _with_struck(course: Course, struck: Array, elapsed: Array) -> Course:
+    """The course with the covariance of balls that were hit just before its start.
+
+    Nothing is known of where they fly: their mean through drag and bounces would be no path of a ball. So the mean is
+    that of the others, and what is straight of a flight carries the covariance.
+
+    Args: struck: (n, d, d) at the start.  elapsed: (n, k) s since then.
+    """
+    onward = np.tile(np.eye(struck.shape[-1]), (len(course), len(struck), 1, 1))
+    onward[..., range(3), range(3, 6)] = elapsed.T[..., None]  # the position by the velocity
+    return replace(course, covariance=course.covariance + onward @ struck @ onward.swapaxes(-1, -2))
 
 
 def _carried(jacobian: Array, covariance: Array, noise: Array) -> Array:

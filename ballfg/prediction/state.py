@@ -42,6 +42,8 @@ class BallState:
         name: of the track.
         other_side: (9, 9) part of the covariance for the chance that the ball is on the other side of a near contact,
             or None. Predictions leave it out, since both sides soon move alike; the next contact alone has it.
+        struck: (9 + p, 9 + p) part of the covariance for the chance that the ball was hit just before, or None.
+            Predicted paths have the mean of a ball that flies on, and the covariance of both.
     """
 
     time: float
@@ -51,6 +53,7 @@ class BallState:
     world: World | None = None
     name: str = ""
     other_side: Array | None = None
+    struck: Array | None = None
 
     def __repr__(self) -> str:
         rows = (("position", POSITION, 3, "m", 1e3, "mm"), ("velocity", VELOCITY, 2, "m/s", 1e2, "cm/s"))

@@ -46,13 +46,14 @@ def test_a_path_ahead(estimate: bf.Estimate) -> None:
 
 
 def test_one_of_several_balls(estimate: bf.Estimate) -> None:
-    from ballfg.prediction import Belief, Propagator
+    from ballfg.prediction import Propagator
     from ballfg.prediction.forecast import carried_by
 
     propagator, belief = carried_by(estimate.last)
     assert isinstance(propagator, Propagator)
-    later = replace(belief, mean=belief.mean + 0.1)
-    several = propagator.rollout(Belief.joined([belief, later]), estimate.last.time + np.array([[0.1, 0.2, 0.3]] * 2))
+    time, covariance = np.tile(belief.time, 2), np.tile(belief.covariance, (2, 1, 1))
+    both = replace(belief, time=time, mean=np.concatenate((belief.mean, belief.mean + 0.1)), covariance=covariance)
+    several = propagator.rollout(both, estimate.last.time + np.array([[0.1, 0.2, 0.3]] * 2))
     for ball, figure in ((0, several.plot()), (1, several.plot(1))):
         sigmas = np.sqrt(np.diagonal(several.covariances[ball], axis1=1, axis2=2))
         check(figure, "prediction", several.times[ball], several.states[ball, :, :3], sigmas)

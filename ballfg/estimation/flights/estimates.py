@@ -132,6 +132,7 @@ def _assembled(
         iterations=sum(one.iterations for one in found),
         world=final.world,
         other_sides=sides,
+        struck={parts[-1][0] + k: share for k, share in final.struck.items()},
     )
 
 

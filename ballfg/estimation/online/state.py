@@ -139,7 +139,6 @@ class OnlineState(BallState):
         revised: number of last samples that were retracted and explained anew.
         rebuilt: True if iSAM2 failed and the window was rebuilt.
         status: OK, or a remedy.
-        struck: (9 + p, 9 + p) part of the covariance for the chance that the ball was hit just before, or None.
     """
 
     innovation: Array
@@ -147,4 +146,3 @@ class OnlineState(BallState):
     revised: int
     rebuilt: bool
     status: Status
-    struck: Array | None = None

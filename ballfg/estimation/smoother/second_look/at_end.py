@@ -97,7 +97,8 @@ def with_hit_at_end(smoother: Smoother, problem: TrackProblem, estimate: Estimat
     covariances, cross = estimate.covariances.copy(), estimate.cross_covariances.copy()
     for k, joint in found.items():
         covariances[k], cross[k] = joint[:STATE_DIM, :STATE_DIM], joint[:STATE_DIM, STATE_DIM:]
-    return replace(estimate, covariances=covariances, cross_covariances=cross)
+    struck = {k: joint - estimate[k].joint for k, joint in found.items()}
+    return replace(estimate, covariances=covariances, cross_covariances=cross, struck=struck)
 
 
 def with_fall_at_end(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
