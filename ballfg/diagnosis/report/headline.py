@@ -77,7 +77,8 @@ def headline(diagnosis: Diagnosis) -> str:
     """The answer for a reader without knowledge of the model and statistics, and the gain of predictions."""
     effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
     if not effects and diagnosis.verdict is not Verdict.UNEXPLAINED:
-        return f"Nothing that the model lacks was found: {_quality(diagnosis)}, and what is left looks like noise."
+        nothing = "No effect on the ball is missing" if diagnosis.findings else "Nothing that the model lacks was found"
+        return f"{nothing}: {_quality(diagnosis)}, and what is left looks like noise."
     if not effects:
         left = where(diagnosis.unexplained.where)
         said = f"Something is missing from the model that no known effect explains: {left}."
@@ -90,7 +91,8 @@ def headline(diagnosis: Diagnosis) -> str:
     else:
         count = COUNTS[len(effects)] if len(effects) < len(COUNTS) else f"{len(effects)}"
         said, what = f"{count} effects are missing from the model.", "With them"
-    return " ".join(part for part in (said, gain(diagnosis, what)) if part)
+    more = "Something else is missing too." if effects and diagnosis.verdict is Verdict.UNEXPLAINED else ""
+    return " ".join(part for part in (said, gain(diagnosis, what), more) if part)
 
 
 def further(diagnosis: Diagnosis) -> Iterator[str]:
@@ -102,7 +104,7 @@ def further(diagnosis: Diagnosis) -> Iterator[str]:
         said = wording.in_plain_words(f)
         yield f"Not an effect on the ball but noise of the measurements: {said[:1].lower()}{said[1:]}"
     if effects and diagnosis.verdict is Verdict.UNEXPLAINED:
-        yield f"Something else is missing too, which no known effect explains: {where(diagnosis.unexplained.where)}."
+        yield f"What else is missing no known effect explains: {where(diagnosis.unexplained.where)}."
 
 
 def gain(diagnosis: Diagnosis, what: str) -> str:

@@ -96,17 +96,18 @@ def test_several_effects_are_counted_and_listed() -> None:
     left = Unexplained("flight: acceleration is off everywhere", 0.4, (GenericTest("flight", "", 1e-9, 0.4),), None)
     many = replace(found(), verdict=Verdict.UNEXPLAINED, findings=(WIND, by_group, jitter), unexplained=left)
     assert headline(many).startswith("Two effects are missing from the model. With them, predictions are off by ")
+    assert headline(many).endswith(" mm. Something else is missing too.")
     assert list(further(many)) == [
         "The air moves at 0.2 m/s along x.",
         "Air drag differs between groups of tracks: top 0.100 ± 0.010 1/m, back 0.200 ± 0.010 1/m.",
         "Not an effect on the ball but noise of the measurements: the time stamps jitter by 0.42 ms from sample to "
         "sample.",
-        "Something else is missing too, which no known effect explains: in flight, acceleration is off everywhere.",
+        "What else is missing no known effect explains: in flight, acceleration is off everywhere.",
     ]
     assert next(certainty(many)).startswith("A wind: practically certain. Chance makes a trace so strong with prob")
     weaker = replace(many, findings=(replace(WIND, held_out_p=1e-4),))
     assert next(certainty(weaker)).startswith("A wind: very likely. ")
-    assert headline(replace(many, findings=(jitter,), verdict=Verdict.FOUND)).startswith("Nothing that the model lacks")
+    assert headline(replace(many, findings=(jitter,), verdict=Verdict.FOUND)).startswith("No effect on the ball")
 
 
 def test_a_pattern_without_a_name() -> None:
