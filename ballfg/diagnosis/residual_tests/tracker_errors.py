@@ -3,6 +3,7 @@
 A memory would absorb any effect that bends flights slowly, so effects are searched first.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,13 +11,15 @@ import numpy as np
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.result import Finding, Value
 from ballfg.dynamics import AnalyticModel
-from ballfg.estimation import dataset_settings
+from ballfg.estimation import Settings, dataset_settings
 from ballfg.estimation.noise.estimate import linearised, spread_over
-from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, NUMBERS, TrackerPart, tracker_noise
+from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, NUMBERS, TrackerNoise, TrackerPart, tracker_noise
+from ballfg.tracks import Track
 from ballfg.tracks.noise import TrackNoise
 
 MOST_TRACKS = 25  # Number of tested tracks of each half, evenly spread
 LONGEST_PART, MOST_SAMPLES = 1.0, 100  # s and samples of a tested track: computing time grows with them
+MOST_LOOKS, SETTLED = 4, 0.02  # Largest number of estimates of the tracks, and the change of the jitter that ends them
 SENTENCES = {
     MEMORY: "The tracker's errors last from sample to sample: a part of them fades over the memory's time.",
     JITTER: "Stamps err: each sample was taken a little before or after the moment that is written.",
@@ -43,18 +46,39 @@ def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> Tr
     whole = [part.track for half in halves for part in half]
     ends = [float(min(t.times[0] + LONGEST_PART, t.times[: MOST_SAMPLES + 1][-1])) for t in whole]
     tracks = [track.until(end) for track, end in zip(whole, ends, strict=True)]
-    linear = linearised(model, holdout.surfaces, settings, tracks, jobs=jobs)
-    if linear is None:
+    found = _settled(model, holdout, settings, tracks, len(halves[0]), jobs)
+    if found is None:
         return TrackerErrors()
-    own = any(track.sigmas is not None for track in tracks)
-    held_out = linear.numbers >= len(halves[0])
-    found = tracker_noise(linear, held_out, settings, None if own else holdout.dataset.info.position_noise)
     noise, declared = found.noise, settings.has_memory or settings.stamp_jitter > 0.0
     if settings.has_memory:
         noise = replace(noise, memory=settings.memory, memory_time=settings.memory_time)
     if settings.stamp_jitter > 0.0:
         noise = replace(noise, stamp_jitter=settings.stamp_jitter)
     return TrackerErrors(tuple(_finding(part) for part in found.parts), noise if found.parts or declared else None)
+
+
+def _settled(
+    model: AnalyticModel, holdout: Holdout, settings: Settings, tracks: Sequence[Track], searched: int, jobs: int
+) -> TrackerNoise | None:
+    """The tracker's noise about estimates that know it; None if all tracks are short.
+
+    To an estimate without jitter, stamps that err most look like outliers; without these the jitter looks too small.
+
+    Args: searched: number of the first tracks, of the half that is searched.
+    """
+    own = any(track.sigmas is not None for track in tracks)
+    known, found = settings.stamp_jitter, None
+    for _ in range(MOST_LOOKS):
+        about = replace(settings, stamp_jitter=known)
+        linear = linearised(model, holdout.surfaces, about, tracks, jobs=jobs)
+        if linear is None:
+            return None
+        stated = None if own else holdout.dataset.info.position_noise
+        found = tracker_noise(linear, linear.numbers >= searched, settings, stated)
+        before, known = known, found.noise.stamp_jitter or 0.0
+        if settings.stamp_jitter > 0.0 or not known or abs(known - before) <= SETTLED * known:
+            break
+    return found
 
 
 def _finding(part: TrackerPart) -> Finding:

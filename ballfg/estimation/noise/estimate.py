@@ -57,6 +57,14 @@ EVERY_SHARE: Final = 0.12
 FIXED_TRACKER: Final = 0.1
 """Weight of the next samples where the tracker's errors are fixed: what these lack shows in the next samples, and would
 count as motion. Else it is 1."""
+MANY: Final = 0.1
+"""Share of samples that estimates leave out as outliers beyond which stamps may err instead. To an estimate without
+jitter those that err most look like outliers, and without them the jitter looks too small: then the tracks are
+estimated anew with the jitter found."""
+MOST_LOOKS: Final = 4
+"""Largest number of such estimates."""
+SETTLED: Final = 0.02
+"""Share by which the jitter grows in the last one."""
 OPEN: Final = 0.7
 """In standard deviations of the prior: an interval beyond it is open, since the prior and not the tracks ends it."""
 
@@ -131,12 +139,19 @@ def estimate_noise(
     parts = [part for track in measured if len(part := track.opening(longest)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
     about = settings if tracker_known else replace(settings, stamp_jitter=0.0)  # a guess of it moves no estimate
-    linear = linearised(model, surfaces, about, parts, watch, jobs=jobs)
-    if linear is None:
-        return None
-    known = (position_known or own_sigmas, tracker_known)
-    # the batches are small: threads gain nothing, and slow each other down on a busy machine
-    return on_one_thread(partial(_searched, parts, settings, known, errors, watch), linear)
+    known, found = (position_known or own_sigmas, tracker_known), None
+    for _ in range(MOST_LOOKS):
+        linear = linearised(model, surfaces, about, parts, watch, jobs=jobs)
+        if linear is None:
+            return None
+        # the batches are small: threads gain nothing, and slow each other down on a busy machine
+        found = on_one_thread(partial(_searched, parts, settings, known, errors, watch), linear)
+        jitter = 0.0 if found is None else found.noise.stamp_jitter or 0.0
+        kept = float(linear.used.sum()) / sum(len(parts[number]) for number in linear.numbers.astype(int).tolist())
+        if kept > 1.0 - MANY or jitter <= about.stamp_jitter * (1.0 + SETTLED):
+            break
+        about = replace(settings, stamp_jitter=jitter)
+    return found
 
 
 def _searched(

@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis import diagnose
+from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.report.report import content
+from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
 from ballfg.diagnosis.result import Verdict
-from ballfg.dynamics import EFFECTS, load_model
+from ballfg.dynamics import EFFECTS, load_model, nominal_model
 from ballfg.dynamics.model_file import model_to_dict
+from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 
-MEMORY, TIME = 0.004, 0.012
+MEMORY, TIME, JITTER = 0.004, 0.012, 0.0015
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +68,28 @@ def test_the_report_lists_it_among_the_effects(diagnosis):
     assert [effect["name"] for effect in report["effects"]] == ["tracker_memory"]
     assert set(report["effects"][0]["parameters"]) == {"sigma", "time"}
     assert report["error"]["after"]["intervals_held"] == diagnosis.after.intervals_held
+
+
+@pytest.fixture(scope="module")
+def jittered(tmp_path_factory):
+    """Thirty shots of a precise tracker whose stamps err by far more than its positions."""
+    folder = tmp_path_factory.mktemp("stamps") / "shots"
+    noise = MeasurementNoise(position=0.001, jitter=JITTER)
+    write_simulation(folder, SimulationConfig(tracks=30, rate=90.0, seed=31, noise=noise))
+    return read_dataset(folder)
+
+
+def test_jitter_is_found_in_its_size_although_the_worst_stamps_look_like_outliers(jittered):
+    model = nominal_model(jittered.ball.radius)
+    found = look_at_tracker(model, hold_out(jittered, model))
+    assert [finding.name for finding in found.findings] == ["stamp_jitter"]
+    sigma = found.findings[0].parameters["sigma"]
+    assert sigma.value == pytest.approx(JITTER, abs=3.0 * sigma.sigma)
+    assert sigma.sigma < 0.05 * JITTER
+
+
+def test_so_does_the_noise_of_forecasts(jittered):
+    model = nominal_model(jittered.ball.radius)
+    settings = dataset_settings(jittered, model)
+    found = estimate_noise(model, dataset_surfaces(jittered), settings, jittered, position_known=True, errors=False)
+    assert found.noise.stamp_jitter == pytest.approx(JITTER, rel=0.1)
