@@ -267,7 +267,8 @@ def opening(estimate: Estimate, count: int) -> Estimate:
     by_sample = ("times", "states", "covariances", "other_sides", "cross_covariances", "quality")
     contacts = tuple(contact for contact in estimate.contacts if contact.interval < count)
     first: dict[str, Any] = {name: getattr(estimate, name)[:count] for name in by_sample}
-    return replace(estimate, **first, contacts=contacts, hits=estimate.hits[estimate.hits < count])
+    struck = {k: share for k, share in estimate.struck.items() if k < count}
+    return replace(estimate, **first, contacts=contacts, hits=estimate.hits[estimate.hits < count], struck=struck)
 
 
 def joined(
@@ -280,13 +281,14 @@ def joined(
     n, p = len(times), whole.cross_covariances.shape[2]
     states, covariances, cross = np.empty((n, STATE_DIM)), np.empty((n, STATE_DIM, STATE_DIM)), np.empty((n, 9, p))
     others = np.zeros((n, STATE_DIM, STATE_DIM))  # nearly empty: `np.zeros` takes no memory for the rest
-    innovations, contacts = dict[str, list[Array]](), list[Contact]()
+    innovations, contacts, struck = dict[str, list[Array]](), list[Contact](), dict[int, Array]()
     hits, quality, begin, status = list[NDArray[np.int64]](), list[NDArray[np.int8]](), 0, Status.OK
     for part in parts:
         inside = slice(begin, begin + len(part))
         states[inside], covariances[inside], cross[inside] = part.states, part.covariances, part.cross_covariances
         for k in np.flatnonzero(part.other_sides.any(axis=(1, 2))):
             others[begin + k] = part.other_sides[k]
+        struck |= {begin + k: share for k, share in part.struck.items()}
         for name, whitened in part.innovations.items():
             innovations.setdefault(name, []).append(whitened)
         contacts += [replace(contact, interval=contact.interval + begin) for contact in part.contacts]
@@ -306,4 +308,5 @@ def joined(
         hits=np.concatenate(hits),
         quality=np.concatenate(quality),
         other_sides=others,
+        struck=struck,
     )
