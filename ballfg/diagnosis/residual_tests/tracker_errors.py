@@ -74,9 +74,12 @@ def _settled(
         if linear is None:
             return None
         stated = None if own else holdout.dataset.info.position_noise
-        found = tracker_noise(linear, linear.numbers >= searched, settings, stated)
-        before, known = known, found.noise.stamp_jitter or 0.0
-        if settings.stamp_jitter > 0.0 or not known or abs(known - before) <= SETTLED * known:
+        looked = tracker_noise(linear, linear.numbers >= searched, settings, stated)
+        jitter = looked.noise.stamp_jitter or 0.0
+        if found is not None and not jitter:  # the first look has shown that there is some; others are for its size
+            break
+        found, before, known = looked, known, jitter
+        if settings.stamp_jitter > 0.0 or abs(known - before) <= SETTLED * known:
             break
     return found
 

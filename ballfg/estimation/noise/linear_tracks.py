@@ -103,6 +103,8 @@ class LinearTracks:
 
 _Piece = dict[str, Array]
 """One linearised track: the fields of `LinearTracks` without the first dimension, by name."""
+LINEAR: Final = ("errors", "transitions", "offsets", "kicks", "starts")
+"""Fields that are finite where the motion about an estimate is linear; about a contact that never comes it is not."""
 
 
 def linearise(
@@ -119,7 +121,7 @@ def linearise(
     pieces, numbers = [], []
     made = map_tracks(partial(_piece, smoother), tracks, len(tracks), jobs)
     for number, piece in enumerate(watch(made, len(tracks), "linearising tracks")):
-        if len(piece["times"]) >= LEAST_SAMPLES and np.isfinite(piece["errors"]).all():
+        if len(piece["times"]) >= LEAST_SAMPLES and all(np.isfinite(piece[name]).all() for name in LINEAR):
             pieces.append(piece)
             numbers.append(number)
     if not pieces:
