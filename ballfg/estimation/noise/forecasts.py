@@ -226,6 +226,7 @@ class _Ahead:
             found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, shifted[rows, POSITION]))
             if (reached >= HORIZONS[-1]).all():
                 break
-        rows, *rest = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        rows, sample, elapsed, by_state, kicks, offsets = (np.concatenate(one) for one in zip(*found, strict=True))
         ends = np.cumsum([0, *(len(parts[0]) for parts in found)]).tolist()
-        return cls(track[rows], start[rows], *rest, apart=[slice(*part) for part in pairwise(ends)])
+        apart = [slice(*part) for part in pairwise(ends)]
+        return cls(track[rows], start[rows], sample, elapsed, by_state, kicks, offsets, apart)
