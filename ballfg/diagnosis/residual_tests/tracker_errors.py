@@ -12,14 +12,13 @@ from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.result import Finding, Value
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings, dataset_settings
-from ballfg.estimation.noise.estimate import linearised, spread_over
+from ballfg.estimation.noise.estimate import MOST_LOOKS, SETTLED, linearised, spread_over
 from ballfg.estimation.noise.tracker_errors import JITTER, MEMORY, NUMBERS, TrackerNoise, TrackerPart, tracker_noise
 from ballfg.tracks import Track
 from ballfg.tracks.noise import TrackNoise
 
 MOST_TRACKS = 25  # Number of tested tracks of each half, evenly spread
 LONGEST_PART, MOST_SAMPLES = 1.0, 100  # s and samples of a tested track: computing time grows with them
-MOST_LOOKS, SETTLED = 4, 0.02  # Largest number of estimates of the tracks, and the change of the jitter that ends them
 SENTENCES = {
     MEMORY: "The tracker's errors last from sample to sample: a part of them fades over the memory's time.",
     JITTER: "Stamps err: each sample was taken a little before or after the moment that is written.",
@@ -67,13 +66,13 @@ def _settled(
     Args: searched: number of the first tracks, of the half that is searched.
     """
     own = any(track.sigmas is not None for track in tracks)
+    stated = None if own else holdout.dataset.info.position_noise
     known, found = settings.stamp_jitter, None
     for _ in range(MOST_LOOKS):
         about = replace(settings, stamp_jitter=known)
         linear = linearised(model, holdout.surfaces, about, tracks, jobs=jobs)
         if linear is None:
             return None
-        stated = None if own else holdout.dataset.info.position_noise
         looked = tracker_noise(linear, linear.numbers >= searched, settings, stated)
         jitter = looked.noise.stamp_jitter or 0.0
         if found is not None and not jitter:  # the first look has shown that there is some; others are for its size

@@ -60,11 +60,12 @@ count as motion. Else it is 1."""
 MANY: Final = 0.1
 """Share of samples that estimates leave out as outliers beyond which stamps may err instead. To an estimate without
 jitter those that err most look like outliers, and without them the jitter looks too small: then the tracks are
-estimated anew with the jitter found."""
+estimated anew with the jitter found. `robot_rallies`, where 6 % are left out, and simulated jitter of 1.5 ms, where a
+quarter is, chose it."""
 MOST_LOOKS: Final = 4
 """Largest number of such estimates."""
 SETTLED: Final = 0.02
-"""Share by which the jitter grows in the last one."""
+"""Share by which the jitter changes at most in the last one."""
 OPEN: Final = 0.7
 """In standard deviations of the prior: an interval beyond it is open, since the prior and not the tracks ends it."""
 
