@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import ArcResponse, weighted
 from ballfg.diagnosis.fit.system import System
@@ -37,8 +37,11 @@ CONTACT: tuple[tuple[Names, Names], ...] = (
     (PLACE[:2], WORLD),
     (SPINS, OWN),
 )
-MEASUREMENT = (PLACE, ("velocity along x", "velocity along y", "vertical velocity"))
+MOTION = ("velocity along x", "velocity along y", "vertical velocity")
+NEAR = ("nearness before a contact", "nearness after a contact")
+MEASUREMENT = (PLACE, MOTION)
 """Groups of quantities that are tested together; those of forces and kicks with the axes of the pattern."""
+NEAR_FRAMES = 2.0  # Nearness falls by a factor of e in so many frames: trackers average over a few
 DRIFT = "recording"  # Kind of the block of drift over a recording, as in reports
 LEAST_SCATTER = 1e-6  # In the unit of a quantity. Smaller scatter is rounding: all tracks have the same value
 
@@ -60,7 +63,7 @@ def blocks_of(fit: Fit) -> list[Block]:
     blocks = [_flight(fit, fit.arcs, group, axes) for group, axes in FLIGHT]
     if after:
         blocks += [_contact(fit, after, group, axes) for group, axes in CONTACT]
-    return blocks + [_measurement(fit, group) for group in MEASUREMENT]
+    return blocks + [_measurement(fit, group) for group in ((*MEASUREMENT, NEAR) if after else MEASUREMENT)]
 
 
 def _flight(fit: Fit, arcs: list[ArcResponse], group: Names, axes: Names) -> Block:
@@ -106,7 +109,8 @@ def _over_arcs(
 
 def _measurement(fit: Fit, group: Names) -> Block:
     used, path, times = fit.problem.stretches.used.numpy(), fit.path, fit.path.times.T.numpy()
-    found = _chosen(group, _quantities(path.states, times, np.zeros_like(times)))
+    quantities = _quantities(path.states, times, np.zeros_like(times)) | _nearness(times, used, path.motion.contacts)
+    found = _chosen(group, quantities)
     scale = _Scale.of(group, found[used])
     moved = PLAUSIBLE["measurement"] * _spread(_axes(WORLD, path.states), scale(found))
     return Block("measurement", group, WORLD, scale(found[used]), weighted(fit, moved, np.arange(len(used))))
@@ -116,7 +120,7 @@ def _quantities(states: Array, times: Array, since: Array) -> dict[str, Array]:
     """All quantities at states (..., 9), times since launch and since the last contact or launch (...,) s."""
     velocity, spin = states[..., VELOCITY], states[..., SPIN]
     about = (flight_axes(torch.from_numpy(velocity)).numpy() @ spin[..., None])[..., 0]
-    vectors = {PLACE: states[..., POSITION], MEASUREMENT[1]: velocity, SPINS: about}
+    vectors = {PLACE: states[..., POSITION], MOTION: velocity, SPINS: about}
     return {
         EVERYWHERE: np.ones_like(times),
         **{name: vector[..., i] for names, vector in vectors.items() for i, name in enumerate(names)},
@@ -127,6 +131,25 @@ def _quantities(states: Array, times: Array, since: Array) -> dict[str, Array]:
         "time since launch": times,
         "time since the last contact": since,
     }
+
+
+def _nearness(times: Array, used: Mask, contacts: torch.Tensor) -> dict[str, Array]:
+    """Quantities NEAR at samples (n, k), of which some are used: 1 at a contact (n, c), fading with the time from it.
+
+    An average over frames, a hidden ball and a late detection all displace positions there and nowhere else.
+    """
+    steps = np.diff(times, axis=1)[used[:, 1:]]
+    fading = NEAR_FRAMES * float(np.median(steps))
+    ways = since_contact(-times, -contacts.numpy()), since_contact(times, contacts.numpy())
+    return {name: np.nan_to_num(np.exp(-way / fading)) for name, way in zip(NEAR, ways, strict=True)}
+
+
+def since_contact(times: Array, contacts: Array) -> Array:
+    """(n, k) s since the last contact (n, c) before times (n, k), NaN before the first one."""
+    after = times[..., None] - contacts[:, None, :]
+    after = np.where(after >= 0.0, after, np.inf)
+    least = after.min(axis=-1, initial=np.inf)
+    return np.where(np.isfinite(least), least, np.nan)
 
 
 def _chosen(group: Names, found: Mapping[str, Array]) -> Array:

@@ -12,7 +12,16 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.patterns import DRIFT, EVERYWHERE, PLAUSIBLE, Block, blocks_of, describe_drift, drift_block
+from ballfg.diagnosis.fit.patterns import (
+    DRIFT,
+    EVERYWHERE,
+    NEAR,
+    PLAUSIBLE,
+    Block,
+    blocks_of,
+    describe_drift,
+    drift_block,
+)
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest
@@ -116,7 +125,7 @@ def where(block: Block, strengths: Array) -> str:
     axis = int(np.argmax((pattern**2).mean(axis=1)))
     share = strengths[axis] ** 2 * (block.values**2).mean(axis=0)
     name = block.quantities[int(np.argmax(share))]
-    size = float(np.percentile(np.abs(pattern[axis]), MOST_SEEN))
+    size = float(np.percentile(np.abs(pattern[axis]), 100.0 if name in NEAR else MOST_SEEN))
     what, unit, factor = {
         "flight": ("acceleration", "m/s^2", 1.0),
         "contact": ("velocity after a contact", "m/s", 1.0),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.diagnosis.fit.patterns import since_contact
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import Piece, free_motion
 from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
@@ -67,11 +67,3 @@ def _contact(found: list[_Row]) -> ContactResiduals:
         for column, shape, kind in zip(columns, shapes, ("i8", "i8", "f8", "f8", "f8", "f8"), strict=True)
     )
     return ContactResiduals(stretch, number, times, incoming, kick[:, :3], kick[:, 3:], covariance)
-
-
-def since_contact(times: Array, contacts: Array) -> Array:
-    """(n, k) s since the last contact (n, c) before times (n, k), NaN before the first one."""
-    after = times[..., None] - contacts[:, None, :]
-    after = np.where(after >= 0.0, after, np.inf)
-    least = after.min(axis=-1, initial=np.inf)
-    return np.where(np.isfinite(least), least, np.nan)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.diagnosis.fit.patterns import since_contact
 from ballfg.diagnosis.fit.response import ACCELERATION, BIN, fitted_path, responses, weighted
 from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_columns
-from ballfg.diagnosis.residual_tests.residuals import residuals_of, since_contact
+from ballfg.diagnosis.residual_tests.residuals import residuals_of
 from ballfg.dynamics.effect import Flight
 from ballfg.dynamics.effects.generic import (
     MOTION_TERMS,
