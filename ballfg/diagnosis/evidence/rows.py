@@ -17,7 +17,7 @@ from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.patterns import blocks_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
-from ballfg.diagnosis.fit.stretches import of_similar_length
+from ballfg.diagnosis.fit.stretches import batches_of, of_similar_length
 from ballfg.state import SPIN, STATE_DIM
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
@@ -35,24 +35,6 @@ class Motion:
 
     columns: tuple[Array, ...]  # (b, m, r) derivatives at the unit of each kind, zero where a stretch has fewer
     kinds: tuple[Index, ...]  # (b, r) kind of each column, -1 for none
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Stretches of similar length: one long stretch would pad all others to its own."""
-
-    numbers: Index  # (b,) of its stretches among all
-    rows: Index  # (m,) numbers of the rows of their samples, then of their spins, among all rows
-
-    def of(self, columns: Array) -> Array:
-        """(b, m, ...) the part of columns (n, 3 k + 3, ...)."""
-        return columns[np.ix_(self.numbers, self.rows)]
-
-
-def batches_of(used: Mask) -> list[Batch]:
-    """The batches of stretches; used: (n, k) samples that there are."""
-    spins = 3 * used.shape[1] + np.arange(3)
-    return [Batch(numbers, np.append(np.arange(3 * count), spins)) for numbers, count in of_similar_length(used)]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from ballfg.diagnosis.evidence.condensed import Condensed
 from ballfg.diagnosis.evidence.likelihood import Batches, Posterior, Reduced, posterior
 from ballfg.diagnosis.evidence.odds import tempered
 from ballfg.diagnosis.evidence.prior import WIDTHS, Priors, centres, choice_odds, log_odds, scales, within
-from ballfg.diagnosis.evidence.rows import Motion, Patterns, batches_of, roots, rows_beside
+from ballfg.diagnosis.evidence.rows import Motion, Patterns, roots, rows_beside
 from ballfg.diagnosis.evidence.weighed import Strengths, Weighed, Weight
+from ballfg.diagnosis.fit.stretches import batches_of
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 TRIED: Final = tuple(range(0, len(WIDTHS), 2))  # Numbers of the widths that are tried: a screen needs no finer ones

@@ -278,7 +278,8 @@ class Fit:
         by_launcher = np.concatenate((none, by_launcher), axis=1)
         rows = np.concatenate((positions, spins), axis=1)
         by_common = np.concatenate((rows[..., STATE_DIM:], by_launcher), axis=-1)
-        return System(self.weighted_residual(self.robust), rows[..., :STATE_DIM], by_common)
+        used = stretches.used.numpy()
+        return System(self.weighted_residual(self.robust), rows[..., :STATE_DIM], by_common, used)
 
 
 def scatter_axes(starts: Array) -> Array:

@@ -88,6 +88,24 @@ def of_similar_length(used: Mask) -> list[tuple[Index, int]]:
     return [(rows, int(counts[rows].max())) for rows in (np.flatnonzero(sizes == size) for size in np.unique(sizes))]
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Stretches of similar length: one long stretch would pad all others to its own."""
+
+    numbers: Index  # (b,) of its stretches among all
+    rows: Index  # (m,) numbers of the rows of their samples, then of their spins, among all rows
+
+    def of(self, columns: Array) -> Array:
+        """(b, m, ...) the part of columns (n, 3 k + 3, ...)."""
+        return columns[np.ix_(self.numbers, self.rows)]
+
+
+def batches_of(used: Mask) -> list[Batch]:
+    """The batches of stretches; used: (n, k) samples that there are."""
+    spins = 3 * used.shape[1] + np.arange(3)
+    return [Batch(numbers, np.append(np.arange(3 * count), spins)) for numbers, count in of_similar_length(used)]
+
+
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
     """The stretches of tracks.
 

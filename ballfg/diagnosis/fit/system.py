@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, Mask
+from ballfg.diagnosis.fit.stretches import Batch, batches_of
 from ballfg.factors.linear.elimination import eliminate_each, padded
 from ballfg.state import STATE_DIM
 
@@ -18,14 +19,18 @@ class Eliminated:
     """A system without its first states."""
 
     solved: Array  # (n, 9, q + 1) first states that absorb each column, the residual last
-    left: Array  # (n, m, q + 1) what they leave of each column, turned
+    left: tuple[tuple[Index, Array], ...]  # Numbers (b,) of alike stretches, and what they leave of each column, turned
 
     @cached_property
     def gram(self) -> Array:
         """(n, q + 1, q + 1) inner products of projected columns, the residual last."""
         # about a path far off squares overflow: what it gives is not finite and loses
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(self.left.swapaxes(-1, -2) @ self.left)
+            grams = [left.swapaxes(-1, -2) @ left for _, left in self.left]
+        found = np.empty((len(self.solved), *grams[0].shape[1:]))
+        for (numbers, _), gram in zip(self.left, grams, strict=True):
+            found[numbers] = gram
+        return found
 
     def common_step(self, precision: Array, pull: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
         """(q,) best step of the common unknowns within limits.
@@ -47,6 +52,7 @@ class System:
     residual: Array  # (n, m) measured minus predicted
     by_start: Array  # (n, m, 9) derivative of the prediction by the first state
     by_common: Array  # (n, m, q) derivative of the prediction by the unknowns that all stretches share
+    used: Mask | None = None  # (n, k) samples that there are, the others' rows are zero; None: all
 
     @property
     def columns(self) -> Array:
@@ -62,19 +68,23 @@ class System:
 
     def eliminated(self, damping: float = 0.0) -> Eliminated:
         """The first states solved for in terms of everything else; `damping` as in Levenberg-Marquardt."""
-        columns, diagonal = self.columns, np.arange(STATE_DIM)
-        n, m, end = *columns.shape[:2], STATE_DIM + columns.shape[-1]
-        rows, upper = np.zeros((n, m, padded(end))), np.zeros((n, STATE_DIM, padded(end)))
-        rows[..., :STATE_DIM], rows[..., STATE_DIM:end] = self.by_start, columns
-        squares = np.einsum("nmi,nmi->ni", self.by_start, self.by_start)
-        upper[:, diagonal, diagonal] = np.sqrt((squares == 0.0) + damping * np.where(squares == 0.0, 1.0, squares))
-        eliminate_each(rows, upper)
-        solved = np.linalg.solve(upper[..., :STATE_DIM], upper[..., STATE_DIM:end])
-        return Eliminated(np.asarray(solved), rows[..., STATE_DIM:end])
+        diagonal, end, left = np.arange(STATE_DIM), STATE_DIM + self.by_common.shape[-1] + 1, []
+        solved = np.zeros((len(self.residual), STATE_DIM, end - STATE_DIM))
+        for batch in [Batch(*map(np.arange, self.residual.shape))] if self.used is None else batches_of(self.used):
+            by_start = batch.of(self.by_start)
+            rows, upper = (np.zeros((len(by_start), count, padded(end))) for count in (by_start.shape[1], STATE_DIM))
+            rows[..., :STATE_DIM], rows[..., STATE_DIM : end - 1] = by_start, batch.of(self.by_common)
+            rows[..., end - 1] = batch.of(self.residual)
+            squares = np.einsum("nmi,nmi->ni", by_start, by_start)
+            upper[:, diagonal, diagonal] = np.sqrt((squares == 0.0) + damping * np.where(squares == 0.0, 1.0, squares))
+            eliminate_each(rows, upper)
+            solved[batch.numbers] = np.linalg.solve(upper[..., :STATE_DIM], upper[..., STATE_DIM:end])
+            left.append((batch.numbers, rows[..., STATE_DIM:end]))
+        return Eliminated(solved, tuple(left))
 
     def start_correction(self, residual: Array) -> Array:
         """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""
-        return System(residual, self.by_start, self.by_common[..., :0]).eliminated().solved[..., 0]
+        return System(residual, self.by_start, self.by_common[..., :0], self.used).eliminated().solved[..., 0]
 
 
 def bounded_step(hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0) -> Array:

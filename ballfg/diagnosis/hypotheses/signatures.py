@@ -4,7 +4,7 @@ Tests of candidate effects need only the inner products of these columns, track 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,7 +76,7 @@ def visible_directions(information: Array, raw: Array) -> Array:
 
 def signatures_of(fit: Fit, system: System, columns: Array) -> Signatures:
     """Inner products of the common columns of a fit and of further columns (n, m, p); system: the fit's, linearised."""
-    whole = System(system.residual, system.by_start, np.concatenate((system.by_common, columns), axis=-1))
+    whole = replace(system, by_common=np.concatenate((system.by_common, columns), axis=-1))
     gram = by_track(whole.eliminated().gram, fit.problem.stretches.track)
     return Signatures(gram, fit.problem.common_precision, system.by_common.shape[-1])
 

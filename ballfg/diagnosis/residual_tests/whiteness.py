@@ -5,14 +5,15 @@ Errors of a tracker with known memory or jitter are whitened by their covariance
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import linalg, stats
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
+from ballfg.state import STATE_DIM
 from ballfg.tracks.noise import TrackNoise
 
 REACHES = (0.02, 0.06, 0.18)
@@ -51,7 +52,12 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None, own: 
     kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
     rows = np.ones(system.residual.shape)  # without outliers, whose pull on the fit would look like drift
     rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
-    system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
+    system = replace(
+        system,
+        residual=system.residual * rows,
+        by_start=system.by_start * rows[..., None],
+        by_common=system.by_common * rows[..., None],
+    )
     if tracker is not None:  # the fit has weighted its samples as if their errors were white
         system = _whitened(fit, system, kept, tracker)
     local = _directions(np.concatenate((system.by_start, system.by_common[..., list(own)]), axis=-1))
@@ -92,33 +98,38 @@ def _p_value(total: float, variance: float, third: float) -> float:
 def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> System:
     """The rows of positions, transformed so that the errors of a tracker with memory and jitter are white."""
     stretches = fit.problem.stretches
-    (n, k), times = stretches.times.shape, stretches.times.numpy()
     stated = stretches.sigmas.numpy()
     typical = np.median(stated[stretches.used.numpy()], axis=0)
     assert tracker.position is not None
     white = np.where(kept[..., None], stated / typical * tracker.position, 1.0)
-    spread = np.zeros((n, k, 3, k, 3))
-    sample = np.arange(k)
-    both = kept[:, :, None] & kept[:, None, :]
+    rows = np.concatenate((system.columns, system.by_start), axis=-1)
+    metres, times = np.where(kept[..., None], fit.sigmas, 1.0), stretches.times.numpy()
+    for number, count in enumerate(stretches.used.numpy().sum(axis=1).tolist()):
+        some, own = kept[number, :count], np.s_[number, : 3 * count]
+        spread = _spread(times[number, :count], fit.predicted.positions[number, :count], some, tracker)
+        spread[np.diag_indices(3 * count)] += white[number, :count].ravel() ** 2
+        right = metres[number, :count].reshape(-1, 1) * rows[own]
+        rows[own] = linalg.solve_triangular(np.linalg.cholesky(spread), right, lower=True, check_finite=False)
+    by_common, residual, by_start = np.split(rows, (rows.shape[-1] - STATE_DIM - 1, -STATE_DIM), axis=-1)
+    return replace(system, residual=residual[..., 0], by_start=by_start, by_common=by_common)
+
+
+def _spread(times: Array, positions: Array, kept: Mask, tracker: TrackNoise) -> Array:
+    """(3 k, 3 k) covariance of what memory and jitter add to samples, zero but for those that are kept.
+
+    Args: times: (k,) s.  positions: (k, 3) m, predicted.  kept: (k,).
+    """
+    k, sample = len(times), np.arange(len(times))
+    spread = np.zeros((k, 3, k, 3))
     if tracker.memory is not None and tracker.memory_time is not None:
-        lasting = np.exp(-np.abs(times[:, :, None] - times[:, None, :]) / tracker.memory_time) * both
+        lasting = np.exp(-np.abs(times[:, None] - times) / tracker.memory_time) * np.outer(kept, kept)
         for axis in range(3):
-            spread[:, :, axis, :, axis] = tracker.memory[axis] ** 2 * lasting
+            spread[:, axis, :, axis] = tracker.memory[axis] ** 2 * lasting
     if tracker.stamp_jitter is not None:
-        steps, moved = np.diff(times, axis=1)[..., None], np.diff(fit.predicted.positions, axis=1)
-        velocities = np.where(steps > 0.0, moved / np.where(steps > 0.0, steps, 1.0), 0.0)  # zero for padding
-        velocities = np.concatenate((velocities, velocities[:, -1:]), axis=1)
-        way = tracker.stamp_jitter * velocities * kept[..., None]
-        spread[:, sample, :, sample, :] += (way[..., :, None] * way[..., None, :]).swapaxes(0, 1)
-    for axis in range(3):
-        spread[:, sample, axis, sample, axis] += white[..., axis] ** 2
-    root = np.linalg.cholesky(spread.reshape(n, 3 * k, 3 * k))
-    metres = np.where(kept[..., None], fit.sigmas, 1.0).reshape(n, 3 * k, 1)
-
-    def turned(rows: Array) -> Array:
-        return np.concatenate((np.linalg.solve(root, metres * rows[:, : 3 * k]), rows[:, 3 * k :]), axis=1)
-
-    return System(turned(system.residual[..., None])[..., 0], turned(system.by_start), turned(system.by_common))
+        velocities = np.diff(positions, axis=0) / np.diff(times)[:, None]
+        way = tracker.stamp_jitter * np.concatenate((velocities, velocities[-1:])) * kept[:, None]
+        spread[sample, :, sample, :] += way[:, :, None] * way[:, None, :]
+    return spread.reshape(3 * k, 3 * k)
 
 
 def _common_step(fit: Fit, system: System) -> Array:
@@ -140,11 +151,11 @@ def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[f
         return 0.0, 0.0, 0.0
     residual, taken, kernel, freedom = residual[tells], taken[tells], kernel[tells], freedom[tells]
     n, k, _ = residual.shape
-    once = np.einsum("nst,ntad->nsad", kernel, taken)
-    rows, moved = taken.reshape(n, 3 * k, -1), once.reshape(n, 3 * k, -1)
+    rows, once = taken.reshape(n, 3 * k, -1), kernel @ taken.reshape(n, k, -1)
+    moved = once.reshape(n, 3 * k, -1)
     inner = rows.swapaxes(-1, -2) @ moved
     squared = moved.swapaxes(-1, -2) @ moved
-    cubed = moved.swapaxes(-1, -2) @ np.einsum("nst,ntad->nsad", kernel, once).reshape(n, 3 * k, -1)
+    cubed = moved.swapaxes(-1, -2) @ (kernel @ once).reshape(n, 3 * k, -1)
     first = -_trace(inner)
     second = 3.0 * (kernel**2).sum(axis=(1, 2)) - 2.0 * _trace(squared) + (inner**2).sum(axis=(1, 2))
     third = 3.0 * ((kernel @ kernel) * kernel).sum(axis=(1, 2)) - 3.0 * _trace(cubed)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy import stats
 
 from ballfg.diagnosis import diagnose
@@ -141,6 +142,21 @@ def test_a_pull_is_found_and_said_where_it_lives(pulled):
     size = float(first.where.split("up to ")[1].split()[0])
     x = pulled.predicted.positions[..., 0]
     np.testing.assert_allclose(size, abs(PULL) * np.percentile(np.abs(x - x.mean()), 95), rtol=0.3)
+
+
+def test_an_average_over_frames_is_found_at_contacts(make_known_ball, make_known_fit, make_launches, make_shots):
+    """A tracker that reports the mean of three frames is late, which no track shows, and cuts corners, which all do."""
+    exact = make_shots(make_known_ball(), make_launches(16, 5), 5, rate=200.0, noise=0.0).stretches
+    shown = np.moveaxis(exact.positions.numpy(), 1, 0)
+    mean = np.moveaxis([shown[max(0, i - 2) : i + 1].mean(axis=0) for i in range(len(shown))], 0, 1)
+    noise = np.random.default_rng(5).normal(0.0, 0.001, mean.shape)
+    positions, sigmas = torch.from_numpy(mean + noise), torch.full_like(exact.sigmas, 0.001)
+    found = generic_tests(make_known_fit(replace(exact, positions=positions, sigmas=sigmas)))
+    assert found[0].p_value < ALARM
+    assert found[0].where.startswith("measurement: error of position vertically depends on nearness ")
+    assert found[0].where.split(" a contact, up to ")[0].split()[-1] in ("before", "after")
+    size = float(found[0].where.split("up to ")[1].split()[0])
+    assert 2.0 < size < 9.0  # mm: at a contact a velocity turns by 5 m/s, and the mean is off by a third of 5 ms of it
 
 
 def test_share_is_what_is_left_of_the_start(pulled, make_known_fit):
