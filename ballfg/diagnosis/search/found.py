@@ -12,13 +12,13 @@ from ballfg.diagnosis.evidence.odds import ALIKE, foretold
 from ballfg.diagnosis.evidence.rows import NAMELESS, Motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.sets import Sets
-from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
+from ballfg.diagnosis.evidence.weighed import Weighed, weighed
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping, groupings
 from ballfg.diagnosis.search.evaluation import on_all
 from ballfg.diagnosis.search.models import WeighedModels, smaller_fit, weighed_without
-from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested, with_absent
+from ballfg.diagnosis.search.refits import Attempt, Refit, refit, retested
 from ballfg.diagnosis.search.score import Scored
 from ballfg.diagnosis.search.trial import offered_varying, screen_of, try_hypotheses, try_varying
 from ballfg.dynamics.variation import place_of
@@ -252,22 +252,11 @@ class Found(WeighedModels):
 def _weighed_refit(
     task: Callable[[], Refit], best: Weighed, motion: Motion, halves: Mask
 ) -> tuple[Refit, Weighed | None]:
-    """A refit of a model with further effects, and how probable it is; None if it has no path.
-
-    The steps of a refit come closest to the samples, where random motion may make other values far more probable. A
-    refit that gains nothing, and about whose path the model without the effects is less probable than it is known to
-    be, begins again from that model's own path.
-    """
+    """A refit of a model with further effects, and how probable it is; None if it has no path."""
     refitted = task()
     if not np.isfinite(refitted.fit.cost):
         return refitted, None
-    named = (*best.named, *refitted.added)
-    found = weighed(refitted.fit, named, motion, halves, best)
-    nested = found.nested.get(best.names)
-    if nested is None or max(found.evidence, nested.evidence) > best.evidence - WORTH_A_STEP:
-        return refitted, found
-    other = weighed(with_absent(best.fit, refitted.added), named, motion, halves, best)
-    return refitted, max(found, other, key=lambda one: one.score)
+    return refitted, weighed(refitted.fit, (*best.named, *refitted.added), motion, halves, best)
 
 
 def _in_place(

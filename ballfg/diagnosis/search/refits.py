@@ -75,34 +75,22 @@ def refit_set(before: Fit, chosen: Sequence[Scored], step: Array, strengths: Arr
 
     Args: step, strengths: as `Screen.step` gives them: a process for the fit then needs no screen, which is large.
     """
-    listed = [one.hypothesis for one in chosen]
-    wider = with_absent(before, listed)
-    problem, values = wider.problem, wider.unknowns.values
+    problem, listed = before.problem, [one.hypothesis for one in chosen]
+    for hypothesis in listed:
+        problem = with_hypothesis(problem, hypothesis)
+    parameters = dict(problem.model.named_parameters())
+    absent = {name: float(parameters[name]) if name in parameters else 0.0 for h in listed for name in h.free()}
     names = [name for hypothesis in listed for name in hypothesis.columns]
     foretold = {
-        name: float(np.clip(values[name] + strength, problem.free[name].low, problem.free[name].high))
+        name: float(np.clip(absent[name] + strength, problem.free[name].low, problem.free[name].high))
         for name, strength in zip(names, strengths.tolist(), strict=True)
     }
-    moved = before.stepped(step)
-    after = followed(wider, replace(moved, values={**values, **moved.values, **foretold}))
+    moved, values = before.stepped(step), before.unknowns.values
+    wider = Fit.at(problem, replace(before.unknowns, values={**values, **absent}), before.noise)
+    after = followed(wider, replace(moved, values={**moved.values, **absent, **foretold}))
     if not np.isfinite(after.cost):  # too long a step: a flight missed its contact
         after = wider
     return Refit(chosen[-1], after, delta_bic(before, after), tuple(listed[:-1]))
-
-
-def with_absent(before: Fit, hypotheses: Sequence[Hypothesis]) -> Fit:
-    """The same path with further effects in the model, free but absent."""
-    problem = before.problem
-    for hypothesis in hypotheses:
-        problem = with_hypothesis(problem, hypothesis)
-    values = before.unknowns.values | _absent(problem, hypotheses)
-    return Fit.at(problem, replace(before.unknowns, values=values), before.noise)
-
-
-def _absent(problem: Problem, hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
-    """The values of the free coefficients of effects that are absent; problem: with the effects in its model."""
-    parameters = dict(problem.model.named_parameters())
-    return {name: float(parameters[name]) if name in parameters else 0.0 for h in hypotheses for name in h.free()}
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
@@ -119,7 +107,8 @@ def refit(before: Fit, scored: Scored) -> Refit:
 
 def _refit(before: Fit, scored: Scored) -> Refit:
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
-    absent = _absent(problem, [hypothesis])
+    parameters = dict(problem.model.named_parameters())
+    absent = {name: float(parameters[name]) if name in parameters else 0.0 for name in hypothesis.free()}
     usual = absent | {hypothesis.parameter(n): hypothesis.coefficients[n].default for n in hypothesis.strengths}
     tried = [_started_at(before, hypothesis, problem, absent)]
     if usual != absent:
