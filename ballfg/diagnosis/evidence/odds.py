@@ -103,19 +103,33 @@ def foretold(
 
 
 def _doubt(model: Weighed, names: frozenset[str], weighed: Mapping[frozenset[str], Weight]) -> float:
-    """What a model with another effect in the place of one, as a linearisation foretells it, may gain too much.
-
-    Far beyond the linear range the linearisation foretells that the tracks hardly need the effect, and so nothing in
-    its place. Where a refit without it says that they do, the other one loses the difference, up to the share of the
-    effect's own gain that it foretells.
-    """
+    """What a model with a further effect, or with another one in the place of one, may be foretold to gain too much."""
+    if model.names < names:
+        return _doubt_beside(model, names, weighed)
     rest = names & model.names
     without, known = model.nested.get(rest), weighed.get(rest)
     if without is None or known is None or not len(rest) + 1 == len(names) == len(model.names):
         return 0.0
+    # Far beyond the linear range the linearisation foretells that the tracks hardly need the effect, and so nothing in
+    # its place. Where a refit without it says that they do, the other one loses the difference, up to the share of the
+    # effect's own gain that it foretells.
     needed, other = model.score - without.score, model.neighbours[names].score - without.score
     share = min(max(other, 0.0) / needed, 1.0) if needed > 0.0 else 0.0
     return (1.0 - share) * max(without.evidence - known.evidence, 0.0)
+
+
+def _doubt_beside(model: Weighed, names: frozenset[str], weighed: Mapping[frozenset[str], Weight]) -> float:
+    """The doubt in a further effect: what its refits beside fewer effects of a model are worse than foretold.
+
+    Each loses what the absence of those effects alone is off; the refit that comes closest to what is foretold counts.
+    """
+    off = []
+    for fewer in model.nested:
+        other = names - model.names | fewer
+        if fewer in weighed and other in weighed and other in model.neighbours:
+            absence = model.nested[fewer].evidence - weighed[fewer].evidence
+            off.append(model.neighbours[other].evidence - weighed[other].evidence - absence)
+    return float(np.clip(min(off, default=0.0), 0.0, max(model.neighbours[names].evidence - model.evidence, 0.0)))
 
 
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:
