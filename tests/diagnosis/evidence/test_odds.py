@@ -202,6 +202,19 @@ def test_in_the_place_of_an_effect_far_beyond_the_linear_range_nothing_is_as_goo
     assert odds.of("frame_tilt") < 0.01
 
 
+REFITS = [(38.0, 30.0, True), (-20.0, 30.0, False), (-20.0, -30.0, True)]
+
+
+@pytest.mark.parametrize(("refitted", "absent", "there"), REFITS)
+def test_a_further_effect_that_refits_beside_fewer_denied_is_not_believed(refitted, absent, there):
+    """Nor does what stands beside it gain: unless the absence of that was foretold just as wrongly."""
+    tilt, wind, lens = "frame_tilt", "wind", "distortion"
+    both, alone, other = model([tilt, wind], 34.0), model([tilt], absent), model([tilt, lens], refitted)
+    both.nested = {alone.names: model([tilt], 30.0)}
+    both.neighbours = {one.names: one for one in (model([tilt, wind, lens], 50.0), model([tilt, lens], 40.0))}
+    assert (odds_of([model([], 0.0), both, alone, other]).of(lens) > 0.9) is there
+
+
 def test_which_sets_were_weighed_without_patterns_too_does_not_decide_beside_them():
     """The wind was, and its gain beside patterns is not borne out over that; nobody knows of the scale's."""
     nothing, wind = model([], 0.0), model(["wind"], 10.0, np.full(10, 6.9))
