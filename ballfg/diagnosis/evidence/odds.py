@@ -119,17 +119,18 @@ def _doubt(model: Weighed, names: frozenset[str], weighed: Mapping[frozenset[str
 
 
 def _doubt_beside(model: Weighed, names: frozenset[str], weighed: Mapping[frozenset[str], Weight]) -> float:
-    """The doubt in a further effect: what its refits beside fewer effects of a model are worse than foretold.
+    """The doubt in a further effect: what its refit beside all but one effect of a model is worse than foretold.
 
-    Each loses what the absence of those effects alone is off; the refit that comes closest to what is foretold counts.
+    It loses what the absence of that one alone is off. The one that the model needs least leads least far away.
     """
-    off = []
-    for fewer in model.nested:
-        other = names - model.names | fewer
-        if fewer in weighed and other in weighed and other in model.neighbours:
-            absence = model.nested[fewer].evidence - weighed[fewer].evidence
-            off.append(model.neighbours[other].evidence - weighed[other].evidence - absence)
-    return float(np.clip(min(off, default=0.0), 0.0, max(model.neighbours[names].evidence - model.evidence, 0.0)))
+    refitted = {fewer: names - model.names | fewer for fewer in model.nested if fewer in weighed}
+    able = [fewer for fewer, other in refitted.items() if other in weighed and other in model.neighbours]
+    if not able:
+        return 0.0
+    fewer = max(able, key=lambda one: weighed[one].evidence)
+    absence = model.nested[fewer].evidence - weighed[fewer].evidence
+    off = model.neighbours[refitted[fewer]].evidence - weighed[refitted[fewer]].evidence - absence
+    return float(np.clip(off, 0.0, max(model.neighbours[names].evidence - model.evidence, 0.0)))
 
 
 def tempered(names: frozenset[str], weight: Weight, others: Mapping[frozenset[str], Weight]) -> float:
