@@ -129,7 +129,7 @@ class Found(WeighedModels):
         the linear range, so that close is a share of what the effect explains.
         """
         best, scores = self.best, self.scores
-        tasks: dict[frozenset[str], Callable[[], tuple[Refit, Weighed]]] = {}
+        tasks: dict[frozenset[str], list[Callable[[], tuple[Refit, Weighed | None]]]] = {}
 
         def exchanged(gone: str, one: int) -> frozenset[str]:
             return best.names - {gone} | {screen.candidates[one].name}
@@ -143,10 +143,10 @@ class Found(WeighedModels):
                 continue
             tell(f"fitting with {other.name} in place of {gone}")
             candidate = next(s for s in scored if s.hypothesis is other)
-            tasks[names] = partial(_in_place, best, own, candidate, self.first, self.motion, self.halves)
-        made = do_all(list(tasks.values()), self.jobs)
-        self.models |= {found.names: found for _, found in made}
-        winner = self.most_probable(found for _, found in made)
+            asked = best, own, candidate, self.first, self.motion, self.halves
+            tasks[names] = [partial(way, *asked) for way in (_in_place, _first_beside)]
+        made = do_all([task for ways in tasks.values() for task in ways], self.jobs)
+        winner = self.most_probable(self.known([found for _, found in made if found is not None]))
         if winner is None or not self.is_better(winner):
             return None
         self.best = winner
@@ -262,12 +262,15 @@ def _weighed_refit(
 def _in_place(
     best: Weighed, gone: Hypothesis, candidate: Scored, first: Fit, motion: Motion, halves: Mask
 ) -> tuple[Refit, Weighed]:
-    """The refit with a candidate in an effect's place, without that first or with both for a while, and its model."""
+    """The refit without an effect and with a candidate in its place, and how probable it is."""
     refitted = refit(smaller_fit(best, [gone], first), candidate)
     named = (*(h for h in best.named if h.name != gone.name), candidate.hypothesis)
-    found = weighed(refitted.fit, named, motion, halves, best)
-    beside, both = _weighed_refit(partial(refit, best.fit, candidate), best, motion, halves)
-    if both is None:
-        return refitted, found
-    other = weighed_without(both, [gone], first, motion, halves)
-    return (beside, other) if other.score > found.score else (refitted, found)
+    return refitted, weighed(refitted.fit, named, motion, halves, best)
+
+
+def _first_beside(
+    best: Weighed, gone: Hypothesis, candidate: Scored, first: Fit, motion: Motion, halves: Mask
+) -> tuple[Refit, Weighed | None]:
+    """The same by way of the refit with both; either way may lead into a poor minimum."""
+    refitted, both = _weighed_refit(partial(refit, best.fit, candidate), best, motion, halves)
+    return refitted, None if both is None else weighed_without(both, [gone], first, motion, halves)
