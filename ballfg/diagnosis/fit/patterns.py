@@ -38,7 +38,7 @@ CONTACT: tuple[tuple[Names, Names], ...] = (
     (SPINS, OWN),
 )
 MOTION = ("velocity along x", "velocity along y", "vertical velocity")
-NEAR = ("nearness before a contact", "nearness after a contact")
+NEAR = ("nearness before a contact", "nearness after a contact")  # Of errors of position, if there are contacts
 MEASUREMENT = (PLACE, MOTION)
 """Groups of quantities that are tested together; those of forces and kicks with the axes of the pattern."""
 NEAR_FRAMES = 2.0  # Nearness falls by a factor of e in so many frames: trackers average over a few
