@@ -131,6 +131,7 @@ def test_a_shoe_that_sways_is_no_ball(ball: World, sized: bool) -> None:
     assert max(judged(strokes, times, states)) < 0.08
 
 
+@pytest.mark.thorough
 def test_how_far_away_a_lob_without_a_bounce_was_is_told_by_its_radius(ball: World) -> None:
     """Radii are all measured a tenth too large, as those of the strokes with a bounce show."""
     hits = (*HITS, 2.44, 3.06, 3.66)
@@ -259,6 +260,7 @@ def test_a_lens_with_distortion_and_two_focal_lengths_is_undone(ball: World) -> 
     assert max(judged(strokes, times, states)) < 0.08
 
 
+@pytest.mark.thorough
 def test_a_rolling_shutter_shows_a_ball_when_its_row_is_read(ball: World) -> None:
     """What was seen at the same moments gives the same states, whatever the stamps."""
     times, states = rally(ball)

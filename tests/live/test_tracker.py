@@ -244,6 +244,7 @@ def test_outliers_begin_no_ball_and_clutter_stays_bounded() -> None:
     assert len(live._newcomers) <= 32
 
 
+@pytest.mark.thorough
 def test_wrong_positions_beside_a_ball_hardly_ever_make_balls() -> None:
     """4 % are 15 to 45 cm off at 150 Hz: with 0.2 s of patience for each they made 16 balls in 50 s."""
     rng, ghosts = np.random.default_rng(12), 0

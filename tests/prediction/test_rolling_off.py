@@ -140,6 +140,7 @@ def test_a_ball_never_bounces_on_the_end_that_it_rolls_over(speed, turn):
     assert (np.diff(moved[fallen, 5]) < 0.0).all()
 
 
+@pytest.mark.thorough
 def test_possible_balls_roll_together_as_each_does_alone():
     """Some roll all the time, some over an end, some lie on the floor, others fly or slide."""
     model = nominal_model("table_tennis").requires_grad_(False)
