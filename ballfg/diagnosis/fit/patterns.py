@@ -4,7 +4,7 @@ A block has one column for every quantity (centred, in units of its scatter over
 block holds declared coefficients that change over a recording.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +63,7 @@ def blocks_of(fit: Fit) -> list[Block]:
     blocks = [_flight(fit, fit.arcs, group, axes) for group, axes in FLIGHT]
     if after:
         blocks += [_contact(fit, after, group, axes) for group, axes in CONTACT]
-    return blocks + [_measurement(fit, group) for group in ((*MEASUREMENT, NEAR) if after else MEASUREMENT)]
+    return blocks + _measurement(fit, (*MEASUREMENT, NEAR) if after else MEASUREMENT)
 
 
 def _flight(fit: Fit, arcs: list[ArcResponse], group: Names, axes: Names) -> Block:
@@ -107,13 +107,16 @@ def _over_arcs(
     return Block(kind, group, axes, scale(values), columns)
 
 
-def _measurement(fit: Fit, group: Names) -> Block:
+def _measurement(fit: Fit, groups: Sequence[Names]) -> list[Block]:
     used, path, times = fit.problem.stretches.used.numpy(), fit.path, fit.path.times.T.numpy()
     quantities = _quantities(path.states, times, np.zeros_like(times)) | _nearness(times, used, path.motion.contacts)
-    found = _chosen(group, quantities)
-    scale = _Scale.of(group, found[used])
-    moved = PLAUSIBLE["measurement"] * _spread(_axes(WORLD, path.states), scale(found))
-    return Block("measurement", group, WORLD, scale(found[used]), weighted(fit, moved, np.arange(len(used))))
+    blocks, axes = [], _axes(WORLD, path.states)
+    for group in groups:
+        found = _chosen(group, quantities)
+        scale = _Scale.of(group, found[used])
+        columns = weighted(fit, PLAUSIBLE["measurement"] * _spread(axes, scale(found)), np.arange(len(used)))
+        blocks.append(Block("measurement", group, WORLD, scale(found[used]), columns))
+    return blocks
 
 
 def _quantities(states: Array, times: Array, since: Array) -> dict[str, Array]:

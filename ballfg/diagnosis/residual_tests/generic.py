@@ -125,7 +125,8 @@ def where(block: Block, strengths: Array) -> str:
     axis = int(np.argmax((pattern**2).mean(axis=1)))
     share = strengths[axis] ** 2 * (block.values**2).mean(axis=0)
     name = block.quantities[int(np.argmax(share))]
-    size = float(np.percentile(np.abs(pattern[axis]), 100.0 if name in NEAR else MOST_SEEN))
+    most = 100.0 if name in NEAR else MOST_SEEN  # few samples are near a contact, and nearness has a bound
+    size = float(np.percentile(np.abs(pattern[axis]), most))
     what, unit, factor = {
         "flight": ("acceleration", "m/s^2", 1.0),
         "contact": ("velocity after a contact", "m/s", 1.0),
