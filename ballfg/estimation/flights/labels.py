@@ -4,7 +4,7 @@ Tracks that fall throughout, which a quick test of their accelerations tells, ar
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.flights.decode import decode
-from ballfg.estimation.flights.modes import AIR, BOUNCE, CHANGE, HANDLED, ROLLING, STILL, STILL_AIR, STRIKE, SWAYED
+from ballfg.estimation.flights.modes import BOUNCE, CHANGE, HANDLED, ROLLING, STILL, STRIKE, SWAYED
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.bank import FLYING, Scene
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
@@ -31,7 +31,9 @@ MERGED: Final = 0.15  # s since its last event after which a hypothesis merges w
 LEAST_MERGED: Final = 12  # Samples, likewise, at least
 MOST: Final = 400  # Largest number of hypotheses
 MARGIN: Final = 25.0  # nats. Hypotheses this far behind the best are dropped
-GAP: Final = SegmentationSettings().short_gap  # s. Over a longer one a flight may bounce unseen: each side by itself
+ANY_BALL: Final = SegmentationSettings(air_growth=1.25)
+"""Of flights whose ball may not be the declared one: its drag is off by as much as lift may be."""
+GAP: Final = ANY_BALL.short_gap  # s. Over a longer one a flight may bounce unseen: each side by itself
 ROLLED: Final = 0.03  # m. A ball that gets less far does not roll
 ALIKE: Final = 0.03  # m. Places within this height of each other are on one surface
 HANDS: Final = 30.0  # nats, by which hands must explain a recording better than flights, strikes and bounces alone
@@ -105,9 +107,7 @@ def _explained(
 ) -> Labels:
     """`label_samples` without gaps."""
     n, step = len(times), float(np.median(np.diff(times))) if len(times) > 1 else 1.0
-    settings = SegmentationSettings(
-        most=MOST, margin=MARGIN, mature=max(LEAST_MERGED, round(MERGED / step)), slack_drift=0.0
-    )
+    settings = replace(ANY_BALL, most=MOST, margin=MARGIN, mature=max(LEAST_MERGED, round(MERGED / step)))
     scene = Scene(physics, Surfaces(0.0), settings)
     given = times - times[0], np.array(positions, order="C"), np.array(sigmas, order="C")
     events, most = decode(*given, True, scene.numbers)
@@ -207,6 +207,6 @@ def _falling(
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         noise = 2.0 * np.sqrt(unscaled[:, 2, 2, None]) / reach**2 * sigma
         off = pull + physics.drag * speed * velocity + np.array([0.0, 0.0, physics.gravity])
-        spread = noise**2 + (STILL_AIR + AIR * physics.drag * speed**2) ** 2
-        telling = (noise[:, 2] ** 2 + STILL_AIR**2) * CLEARLY * MOST_OFF < physics.gravity**2
+        spread = noise**2 + (ANY_BALL.still_air + ANY_BALL.air_growth * physics.drag * speed**2) ** 2
+        telling = (noise[:, 2] ** 2 + ANY_BALL.still_air**2) * CLEARLY * MOST_OFF < physics.gravity**2
         yield telling & ((off**2 / spread).sum(axis=1) < MOST_OFF)

@@ -6,7 +6,7 @@ from typing import Any, Final
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
 from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SCENE, Record
-from ballfg.estimation.segmentation.surface_contact import carry, transform
+from ballfg.estimation.segmentation.surface_contact import air, carry, transform
 
 HANDLED: Final = 1  # Value of `surface` for a ball that a hand moves quickly: throws, catches, pushes
 CARRIED: Final = 2  # For a ball that a hand moves slowly
@@ -20,14 +20,8 @@ STRIKE: Final = 2  # A flying ball is hit, and flies on
 CHANGE: Final = 3  # The mode changes
 SHIFT: Final = 4  # The measurements of a flying ball jump, its velocity stays: the tracker follows something else
 
-STILL_AIR: Final = 0.7  # m/s^2. Spread of the acceleration of a slow flying ball beside gravity and drag
-AIR: Final = 1.25
-"""Its growth, over the ball's own drag: lift of a spinning ball, and drag of another ball than assumed."""
-AIR_MEMORY: Final = 0.5  # s. Time constant of that acceleration
 SHORT: Final = 0.02
 """Time constants up to which a series is exact to 2 % and better than differences of rounded numbers."""
-MOST_AIR: Final = 30.0  # m/s^2, of that spread
-
 PULLS: Final = (0.0, 30.0, 8.0, 1.0, 0.3, 0.0)
 """m/s^2. Spread of the acceleration, per axis, by mode: of a hand that throws or catches, of one that carries, of one
 that holds the ball, of a rolling ball along the ground; none of a ball that does not move. `air` is that of flight."""
@@ -54,7 +48,6 @@ def move(h: Record, dt: float, scene: Record) -> None:
     """A hypothesis dt s later, in its mode."""
     if h.surface == FLYING:
         carry(h, dt, scene)
-        _relax(h, dt, scene)
     elif HANDLED <= h.surface <= SWAYED:
         _wander(h, dt, PULLS[h.surface], MEMORIES[h.surface])
     elif h.surface == ROLLING:
@@ -66,24 +59,6 @@ def move(h: Record, dt: float, scene: Record) -> None:
     else:
         for axis in range(3):
             h.cov[axis, 0, 0] += STIR**2 * dt
-
-
-@machine_code(REAL(ONE_HYPOTHESIS, SCENE))
-def air(h: Record, scene: Record) -> float:
-    """m/s^2, spread of the acceleration of a flying ball beside gravity and drag: spin and wind act with the air."""
-    return STILL_AIR + AIR * scene.drag * (h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
-
-
-@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
-def _relax(h: Record, t: float, scene: Record) -> None:
-    """That acceleration forgets itself within t s."""
-    memory, spread = math.exp(-t / AIR_MEMORY), min(air(h, scene), MOST_AIR)
-    for axis in range(3):
-        h.mean[axis, 2] *= memory
-        for k in range(3):
-            h.cov[axis, 2, k] *= memory
-            h.cov[axis, k, 2] *= memory
-        h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
 
 
 @machine_code(NOTHING(ONE_HYPOTHESIS, REAL, REAL, REAL))

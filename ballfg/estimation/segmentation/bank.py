@@ -145,7 +145,7 @@ class Scene:
         self.surfaces, self.settings, self.physics = surfaces, settings, physics
         s, drift = settings, np.zeros((3, 3, 3))
         drift[2, 0, 0], drift[1, 0, 1], drift[0, 1, 1] = white_acceleration(1.0, s.velocity_drift**2)
-        drift[1, 1, 0], drift[0, 2, 2] = drift[1, 0, 1], s.slack_drift**2
+        drift[1, 1, 0] = drift[1, 0, 1]
         shares = np.log([1.0 - s.wide_share - s.outlier_share, s.wide_share, s.outlier_share])
         extent = np.array((-np.inf, np.inf, -np.inf, np.inf) if surfaces.extent is None else surfaces.extent)
         extent += s.extent_margin * np.array((-1.0, 1.0, -1.0, 1.0))

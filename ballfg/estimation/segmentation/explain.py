@@ -105,7 +105,7 @@ def _rested(work: bank.Work, row: int, sample: bank.Sample, scene: bank.Record, 
     for surface in range(len(surfaces)):
         if abs(sample.position[2] - surfaces[surface].centre) < scene.rest_range:
             down = work.bank[bank.add(work, work.bank, row)]
-            put_down(down, surface, surfaces)
+            put_down(down, surface, scene, surfaces)
             down.score -= scene.start_at_rest_cost
             bank.pass_through(down, work, REST, sample.number - 1, surface, sample.time)
 

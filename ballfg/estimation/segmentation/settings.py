@@ -28,11 +28,15 @@ class SegmentationSettings:
     doubt_margin: float = 25.0
     """nats. Largest distance of the resulting hypothesis from the best one, for that trial."""
 
-    # flight, apart from gravity and drag: spin, wind and a wrong drag act as a slowly drifting acceleration
+    # flight, apart from gravity and drag: lift, wind and a wrong drag are an acceleration, the slack
     slack: float = 4.0
-    """m/s^2. Spread of that acceleration at the start of a segment."""
-    slack_drift: float = 6.0
-    """m/s^2 per sqrt(s). Its random walk."""
+    """m/s^2. Its spread at the start of a segment, where the speed is unknown."""
+    still_air: float = 0.7
+    """m/s^2. Its spread for a slow ball, which no air can hold up."""
+    air_growth: float = 0.45
+    """Growth of this spread, over the ball's own drag: lift of a spinning ball."""
+    air_memory: float = 0.5
+    """s. Time constant within which the slack forgets itself."""
     velocity_drift: float = 0.05
     """m/s per sqrt(s). Random walk of the velocity."""
     velocity_spread: float = 15.0
@@ -49,8 +53,6 @@ class SegmentationSettings:
     """Spread of the restitution on the floor, which a model of the table hardly describes."""
     most_slowing: float = 0.15
     """Largest expected share of the tangential velocity that a bounce of unknown spin removes."""
-    slack_at_contact: float = 3.0
-    """m/s^2. A bounce changes the spin, and so the slack acceleration."""
     contact_window: float = 0.012
     """s. Largest distance of a predicted contact outside of its interval."""
     extent_margin: float = 0.05

@@ -18,8 +18,6 @@ STRONGEST_DRAG: Final = 0.5
 two outliers 1 ms apart."""
 REST_SIGMA: Final = 0.003
 """m. Spread of the measured height of a resting ball about its surface, constant during the rest."""
-REST_SLACK: Final = 0.5
-"""m/s^2. Slack acceleration of a rolling ball: rolling resistance and friction."""
 LANDING_SIGMA: Final = 0.2
 """m/s. Change of the horizontal velocity of a ball that stays down."""
 
@@ -55,6 +53,30 @@ def forget(h: bank.Record, surface: int, position: Array, variance: float, speed
         h.cov[axis, 2, 2] = slack * slack
 
 
+MOST_AIR: Final = 30.0
+"""m/s^2. Largest spread of the slack: bounds absurd velocities."""
+
+
+@machine_code(REAL(bank.ONE_HYPOTHESIS, bank.SCENE))
+def air(h: bank.Record, scene: bank.Record) -> float:
+    """m/s^2, spread of the slack acceleration of a flying ball: spin and wind act with the air."""
+    squared = h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2
+    return min(scene.still_air + scene.air_growth * scene.drag * squared, MOST_AIR)
+
+
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, REAL, bank.SCENE))
+def _relax(h: bank.Record, t: float, scene: bank.Record) -> None:
+    """The slack forgets itself within t s; that of a ball on a surface is friction."""
+    flying = h.surface == bank.FLYING
+    memory, spread = math.exp(-t / scene.air_memory), air(h, scene) if flying else scene.friction * scene.gravity
+    for axis in range(3 if flying else 2):
+        h.mean[axis, 2] *= memory
+        for k in range(3):
+            h.cov[axis, 2, k] *= memory
+            h.cov[axis, k, 2] *= memory
+        h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
+
+
 @machine_code(NOTHING(bank.ONE_HYPOTHESIS, REAL, bank.SCENE))
 def carry(h: bank.Record, t: float, scene: bank.Record) -> None:
     """A hypothesis t s later, without an event: a flying ball flies, a resting one stays down; changes `h`.
@@ -75,10 +97,11 @@ def carry(h: bank.Record, t: float, scene: bank.Record) -> None:
         if axis == 2:
             mean[0] -= scene.gravity * half
             mean[1] -= scene.gravity * t
+    _relax(h, step, scene)
 
 
-@machine_code(NOTHING(bank.ONE_HYPOTHESIS, COUNT, bank.SURFACES))
-def put_down(h: bank.Record, surface: int, surfaces: bank.Records) -> None:
+@machine_code(NOTHING(bank.ONE_HYPOTHESIS, COUNT, bank.SCENE, bank.SURFACES))
+def put_down(h: bank.Record, surface: int, scene: bank.Record, surfaces: bank.Records) -> None:
     """Makes a hypothesis rest on a surface."""
     h.surface = surface
     h.mean[2, 0] = surfaces[surface].centre + h.shift[2]
@@ -91,7 +114,7 @@ def put_down(h: bank.Record, surface: int, surfaces: bank.Records) -> None:
         h.mean[axis, 2] = 0.0
         for k in range(3):
             h.cov[axis, 2, k] = h.cov[axis, k, 2] = 0.0
-        h.cov[axis, 2, 2] = REST_SLACK**2
+        h.cov[axis, 2, 2] = (scene.friction * scene.gravity) ** 2
         h.cov[axis, 1, 1] += LANDING_SIGMA**2
 
 
@@ -101,7 +124,7 @@ def lift(h: bank.Record, scene: bank.Record) -> None:
     h.surface = bank.FLYING
     h.cov[2, 1, 1] += scene.leave_speed**2
     for axis in range(3):
-        h.cov[axis, 2, 2] += scene.slack**2
+        h.cov[axis, 2, 2] += air(h, scene) ** 2
 
 
 SLOWEST_CLOSING: Final = 0.2
@@ -184,7 +207,7 @@ def _branch(
         bank.pass_through(here, work, CONTACT, step.interval, surface, step.start + time)
         if speed < scene.rest_speed and here.cov[2, 1, 1] < KNOWN_SPEED**2:
             down = work.bank[bank.add(work, landed, count - 1)]
-            put_down(down, surface, surfaces)
+            put_down(down, surface, scene, surfaces)
             carry(down, step.dt - time, scene)
             down.score -= scene.rest_cost
             bank.pass_through(down, work, REST, step.interval, surface, step.start + step.dt)
@@ -250,4 +273,4 @@ def _bounce(h: bank.Record, surface: bank.Record, scene: bank.Record) -> None:
     h.cov[2, 0, 0] += ((1.0 + e) * scene.surface_sigma) ** 2
     h.cov[2, 1, 1] += (BOUNCE_JITTER + surface.restitution_sigma * speed) ** 2
     for axis in range(3):
-        h.cov[axis, 2, 2] += scene.slack_at_contact**2
+        h.cov[axis, 2, 2] += air(h, scene) ** 2

@@ -14,13 +14,12 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.flights.dataset import error_ratios, flies_throughout, flights_of, in_flight, pieces_of
 from ballfg.estimation.flights.decode import decode
 from ballfg.estimation.flights.estimates import estimated
-from ballfg.estimation.flights.labels import MARGIN, MOST, falls_throughout, label_samples, scatter
+from ballfg.estimation.flights.labels import ANY_BALL, MARGIN, MOST, falls_throughout, label_samples, scatter
 from ballfg.estimation.flights.modes import HANDLED, SWAYED, _wandered
 from ballfg.estimation.result import Label
 from ballfg.estimation.segmentation.bank import HYPOTHESIS, LOGGED, Scene
 from ballfg.estimation.segmentation.log import chain, compact
 from ballfg.estimation.segmentation.physics import physics_of
-from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
 from ballfg.tracks.dataset import dataset_in_memory
@@ -225,7 +224,7 @@ def test_without_a_hand_in_it_an_explanation_is_that_of_flights_alone() -> None:
     agreed = 0
     launched = [shot.track for shot in simulate(SimulationConfig(tracks=25, seed=31))]
     for track in (*launched, *(recording(seed).track for seed in (9100, 9103))):
-        scene = Scene(PHYSICS, Surfaces(0.0), SegmentationSettings(most=MOST, margin=MARGIN, slack_drift=0.0))
+        scene = Scene(PHYSICS, Surfaces(0.0), replace(ANY_BALL, most=MOST, margin=MARGIN))
         sigmas = np.maximum(np.tile(scatter(track.seconds, track.positions), (len(track), 1)), 1.5e-3)
         given = track.seconds, np.array(track.positions, order="C"), sigmas
         (alone, least), (events, most) = (decode(*given, hands, scene.numbers) for hands in (False, True))
