@@ -9,6 +9,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.online.final import unknown
 from ballfg.estimation.online.first_rest import FirstRest
+from ballfg.estimation.online.hop_doubt import HopDoubt
 from ballfg.estimation.online.state import Measurement, OnlineState, Sample
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.plausible import possible
@@ -52,12 +53,13 @@ class Newest:
         self.hit = HitDoubt(owner.settings, owner.events.settings)
         self.rest = RestDoubt(owner.events.settings)
         self.first = FirstRest(self.monitor.model, owner.events.settings)
+        self.hops = HopDoubt(owner)
 
     def copy(self) -> "Newest":
         """The same, which further samples leave as it is."""
         other = copy.copy(self)
         other.monitor, other.hit = copy.copy(self.monitor), copy.copy(self.hit)
-        other.rest, other.first = copy.copy(self.rest), copy.copy(self.first)
+        other.rest, other.first, other.hops = copy.copy(self.rest), copy.copy(self.first), self.hops.copy()
         return other
 
     def after(
@@ -68,7 +70,8 @@ class Newest:
         state = self._state(window, samples[-1], contact, update)
         state = self._in_doubt_of_rolling(state)
         state = self._in_doubt_of_rest(state, samples, before)
-        return self._in_doubt_of_a_hit(state, samples, None if contact is not None else before)
+        state = self._in_doubt_of_a_hit(state, samples, None if contact is not None else before)
+        return self.hops.after(state, samples[-1])
 
     def joined(self, window: StreamWindow, samples: list[Sample], sighting: Measurement, update: Update) -> OnlineState:
         """The state after a further sighting of the newest sample; a rebuilt window holds it without a contact."""

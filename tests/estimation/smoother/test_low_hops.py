@@ -10,7 +10,8 @@ import pytest
 from ballfg.estimation.result import Status
 from ballfg.estimation.segmentation.result import Segmentation
 from ballfg.estimation.smoother.second_look.hop_grid import RESTS, SPEEDS, HopGrid, HopLaw, averaged
-from ballfg.estimation.smoother.second_look.low_hops import _Ball, counted, uncounted_note
+from ballfg.estimation.smoother.second_look.hopping_ball import HoppingBall
+from ballfg.estimation.smoother.second_look.low_hops import counted, uncounted_note
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 from tests.estimation.low_bounces import LIMIT, LYING, MODEL, SETTINGS, SURFACES, beside_bounces, hopping_out
@@ -59,7 +60,7 @@ def test_before_the_first_sample_each_hop_is_as_probable_and_rest_has_its_share(
 
 
 def test_the_gap_of_a_ball_is_its_height_above_where_it_touches() -> None:
-    ball = _Ball(MODEL, SETTINGS["coefficients estimated"])
+    ball = HoppingBall(MODEL, SETTINGS["coefficients estimated"])
     gap = ball.gap(np.array([[0.0, 0.0, LYING], [0.1, 0.2, LYING + 0.05]]), 0.0)
     assert gap[1] - gap[0] == pytest.approx(0.05)
     assert abs(gap[0]) < 0.01
@@ -153,3 +154,22 @@ def test_tracks_without_low_hops_keep_their_events() -> None:
     events: Segmentation = smoother.segment(track)
     assert smoother.low_hops(track, events) == ()
     assert counted(events, (), track.times) is events
+
+
+def test_filtered_forwards_a_hop_is_known_as_well_at_its_last_sample():
+    """The backward pass adds nothing there: a filter over heights of the surface is the average of the smoothers."""
+    grid, levels = HopGrid(NEARLY_EXACT, 48, 1e-4), np.array([0.0, 0.002])
+    rng, times = np.random.default_rng(3), np.arange(40) / 100.0
+    heights, sigma = 0.004 + rng.normal(0.0, 0.002, 40), np.full(40, 0.002)
+    belief = grid.unknown(levels).weighed(heights[0], 0.002)
+    for ticks, height in zip(grid.ticks(times), heights[1:], strict=True):
+        belief = belief.moved(ticks).weighed(height, 0.002)
+    assert np.allclose(belief.said, grid.evidence(times, heights, sigma, levels), rtol=0, atol=1e-9)
+    each = [grid.moments(times, heights - level, sigma) for level in levels]
+    weights = np.exp(belief.said - belief.said.max())
+    last, found = averaged(each, levels, weights / weights.sum()).select(slice(39, 40)), belief.moments()
+    for name in ("mean", "second", "higher", "speed", "resting"):
+        assert np.allclose(getattr(found, name), getattr(last, name), rtol=1e-9, atol=1e-15), name
+    moves, rests = belief.moving().moments(), found.resting
+    assert moves.resting == 0.0
+    assert np.allclose((1.0 - rests) * moves.speed, found.speed, rtol=1e-9)

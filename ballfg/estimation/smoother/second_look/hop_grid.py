@@ -11,7 +11,7 @@ docs/derivations/smoother.md, "Low hops".
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -102,10 +102,11 @@ class HopGrid:
     Args:
         law: of the hops.  phases: number of cells for the duration of each hop.
         tick: s, to which stamps are rounded, so that few transition matrices are needed.
+        finest: m, least noise of a sample that the cells resolve.
     """
 
-    def __init__(self, law: HopLaw, phases: int, tick: float) -> None:
-        self.law, self.phases, self.tick = law, phases, tick
+    def __init__(self, law: HopLaw, phases: int, tick: float, finest: float = 0.0) -> None:
+        self.law, self.phases, self.tick, self.finest = law, phases, tick, finest
         self.grid = HopLaw.speeds(law.fastest)
         share = np.tile((np.arange(phases) + 0.5) / phases, SPEEDS)
         self.speed = np.append(np.repeat(self.grid, phases), 0.0)
@@ -126,21 +127,20 @@ class HopGrid:
 
     def evidence(self, times: Array, heights: Array, sigma: Array, levels: Array) -> Array:
         """(k,) log likelihoods for levels (k,) m of the surface, -inf if far behind; arguments as of `moments`."""
-        found, alive = np.full(len(levels), -np.inf), np.arange(len(levels))
-        said, before = np.zeros(len(levels)), np.tile(self._first, (len(levels), 1))
+        found, belief = np.full(len(levels), -np.inf), self.unknown(levels)
         for k, ticks in enumerate([*self.ticks(times).tolist(), None]):
-            now = before * self._likelihood(heights[k] - levels[alive], sigma[k])
-            total = now.sum(axis=1)
-            said, now = said + np.log(total), now / total[:, None]
-            kept = said > said.max() - FAR_BEHIND
-            alive, said, now = alive[kept], said[kept], now[kept]
-            if ticks is None or (now[:, -1] > 1.0 - MILLIONTH).all():
+            belief = belief.weighed(heights[k], sigma[k])
+            if ticks is None or (belief.cells[:, -1] > 1.0 - MILLIONTH).all():
                 break
-            before = now @ self._step(ticks)[0]
+            belief = belief.moved(ticks)
         rest = zip(heights[k + 1 :], sigma[k + 1 :], strict=True)  # while the ball lies still
-        left = [np.log(self._likelihood(height - levels[alive], noise)[:, -1]) for height, noise in rest]
-        found[alive] = said + np.sum(left, axis=0)
+        left = [np.log(self.likelihood(height - belief.levels, noise)[:, -1]) for height, noise in rest]
+        found[np.isin(levels, belief.levels)] = belief.said + np.sum(left, axis=0)
         return found
+
+    def unknown(self, levels: Array) -> "HopBelief":
+        """What is known before the first sample, for levels (k,) m of the surface."""
+        return HopBelief(self, levels, np.zeros(len(levels)), np.tile(self._first, (len(levels), 1)))
 
     def moments(self, times: Array, heights: Array, sigma: Array) -> HopMoments:
         """Moments of the motion from (n,) s, heights (n,) m and sigma (n,) m, by the forward-backward algorithm."""
@@ -151,18 +151,20 @@ class HopGrid:
         later = np.ones(len(self.speed))
         known[len(filtered) - 1] = filtered[-1] @ self._features
         for k in range(len(filtered) - 2, -1, -1):
-            follow, counted = self._step(int(steps[k]))
-            said = self._likelihood(heights[k + 1], sigma[k + 1]) * later
+            follow, counted = self.step(int(steps[k]))
+            said = self.likelihood(heights[k + 1], sigma[k + 1]) * later
             before = follow @ said
             scale = filtered[k] @ before
             bounces[k] = filtered[k] @ (counted @ said) / scale
             later = before / scale
             known[k] = (filtered[k] * later) @ self._features
-        z, v, zz, zv, vv, _, _, speed, resting = known.T
-        second = np.stack((np.stack((zz, zv), axis=-1), np.stack((zv, vv), axis=-1)), axis=-2)
-        return HopMoments(np.stack((z, v), axis=-1), second, known[:, 5:7], speed, resting, bounces)
+        return _moments(known, bounces)
 
-    def _likelihood(self, heights: Array | float, sigma: float) -> Array:
+    def moments_of(self, cells: Array) -> HopMoments:
+        """The moments for probabilities (n, k) of the cells at n moments; bounces are not counted."""
+        return _moments(cells @ self._features, np.zeros(len(cells) - 1))
+
+    def likelihood(self, heights: Array | float, sigma: float) -> Array:
         """(..., k) density of samples at heights (...) m in each cell."""
         off = (np.asarray(heights)[..., None] - self.height) / sigma
         good = (1.0 - STRAY_SHARE) * np.exp(-0.5 * off**2) / sigma
@@ -172,14 +174,14 @@ class HopGrid:
         """(k,) probabilities of the cells after each sample, until the ball surely lies still."""
         before, found = self._first, list[Array]()
         for k in range(len(heights)):
-            now = before * self._likelihood(heights[k], sigma[k])
+            now = before * self.likelihood(heights[k], sigma[k])
             found.append(now / now.sum())
             if k == len(steps) or found[-1][-1] > 1.0 - MILLIONTH:
                 break
-            before = found[-1] @ self._step(int(steps[k]))[0]
+            before = found[-1] @ self.step(int(steps[k]))[0]
         return found
 
-    def _step(self, ticks: int) -> "tuple[csr_array, csr_array]":
+    def step(self, ticks: int) -> "tuple[csr_array, csr_array]":
         """(k, k) probabilities of the cells over some ticks, and these times the number of bounces on the way."""
         if ticks not in self._steps:
             from scipy.sparse import csr_array  # few tracks hop low, and it takes a tenth of a second to import
@@ -215,6 +217,57 @@ class HopGrid:
         weights = [(1 - upper) * (1 - right), (1 - upper) * right, upper * (1 - right), upper * right]
         target = np.where(rests, len(rests) - 1, np.stack(targets))
         return target.ravel(), share * np.stack(weights).ravel(), np.tile(bounces, 4)
+
+
+@dataclass(frozen=True)
+class HopBelief:
+    """What samples so far say of a hop, for some heights of the surface.
+
+    Attributes:
+        grid: of hops.  levels: (k,) m, heights of the surface.  said: (k,) nats, their log evidence.
+        cells: (k, c) probabilities of the grid's cells at each of them.
+    """
+
+    grid: HopGrid
+    levels: Array
+    said: Array
+    cells: Array
+
+    def weighed(self, height: float, sigma: float) -> "HopBelief":
+        """After a sample at a height in m with the noise sigma in m; levels far behind are dropped."""
+        cells = self.cells * self.grid.likelihood(height - self.levels, sigma)
+        total = cells.sum(axis=1)
+        said = self.said + np.log(total)
+        kept = said > said.max() - FAR_BEHIND
+        return replace(self, levels=self.levels[kept], said=said[kept], cells=(cells / total[:, None])[kept])
+
+    def moved(self, ticks: int) -> "HopBelief":
+        """Some ticks later."""
+        return replace(self, cells=self.cells @ self.grid.step(ticks)[0])
+
+    def moving(self) -> "HopBelief":
+        """What is known if the ball does not lie still."""
+        moves = self.cells[:, :-1].sum(axis=1)
+        kept = moves > 0.0
+        cells, moves = self.cells[kept], moves[kept]
+        cells[:, -1] = 0.0
+        return replace(
+            self, levels=self.levels[kept], said=self.said[kept] + np.log(moves), cells=cells / moves[:, None]
+        )
+
+    def moments(self) -> HopMoments:
+        """The moments of one moment, averaged over the levels."""
+        by_level = self.grid.moments_of(self.cells)
+        weights = np.exp(self.said - self.said.max())
+        each = [by_level.select(slice(k, k + 1)) for k in range(len(self.levels))]
+        return averaged(each, self.levels, weights / weights.sum())
+
+
+def _moments(known: Array, bounces: Array) -> HopMoments:
+    """Moments from expected features (n, 9) of the cells."""
+    z, v, zz, zv, vv, _, _, speed, resting = known.T
+    second = np.stack((np.stack((zz, zv), axis=-1), np.stack((zv, vv), axis=-1)), axis=-2)
+    return HopMoments(np.stack((z, v), axis=-1), second, known[:, 5:7], speed, resting, bounces)
 
 
 def averaged(known: Sequence[HopMoments], levels: Array, weights: Array) -> HopMoments:

@@ -15,28 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, median
-from ballfg.dynamics.compiled.kept_model import augmented
-from ballfg.dynamics.compiled.places import numbers_of
-from ballfg.dynamics.motion.arrays import acceleration, bounced, gaps
+from ballfg.dynamics.motion.arrays import bounced
 from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation.result import Contact, Rest, Segmentation
-from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.settings import Settings, sample_sigmas
-from ballfg.estimation.smoother.second_look.hop_grid import HopGrid, HopLaw, HopMoments, averaged
-from ballfg.state import POSITION, STATE_DIM, VZ, Z
+from ballfg.estimation.smoother.second_look.hop_grid import HopGrid, HopMoments, averaged
+from ballfg.estimation.smoother.second_look.hopping_ball import HoppingBall, hop_time, most_height
+from ballfg.state import VZ, Z
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
     from ballfg.dynamics.model import BallModel
 
-LOW: Final = 10.0
-"""Standard deviations of the noise. The segmentation distinguishes the bounces of higher hops."""
-LOWEST: Final = 0.02
-"""m. Lower hops it does not distinguish whatever the noise: it assumes an error of 4 mm in surface heights."""
-LEAST_PHASES, MOST_PHASES = 48, 192
-"""Number of cells in a hop: if possible so many that the ball moves by no more than its noise within one."""
 UNLIKELY: Final = 1e-2
 """Share of the likelihood of the best surface height; less likely heights are left out."""
 WIDEST: Final = 2.5
@@ -108,9 +100,9 @@ def low_hops(
     """
     if len(track) < 2:
         return ()
-    sigma, ball, found = _height_sigmas(track, settings), _Ball(model, settings), list[LowHops]()
-    most = max(LOWEST, LOW * float(median(sigma)))
-    unseen = np.diff(track.times) > _hop(most, ball.gravity(track.positions[0]))
+    sigma, ball, found = _height_sigmas(track, settings), HoppingBall(model, settings), list[LowHops]()
+    most = most_height(float(median(sigma)))
+    unseen = np.diff(track.times) > hop_time(most, ball.gravity(track.positions[0]))
     for number, height in enumerate(surfaces.heights()):
         gap = ball.gap(track.positions, height)
         low = np.abs(gap) < most
@@ -120,23 +112,13 @@ def low_hops(
             if first == last:
                 continue
             position, inside = track.positions[first], slice(first, last + 1)
-            gravity = ball.gravity(position)
-            if track.times[last] - track.times[first] <= _hop(most, gravity):
+            if track.times[last] - track.times[first] <= hop_time(most, ball.gravity(position)):
                 continue
-            law = ball.law(position, most, gravity)
-            phases = int(np.clip(4.0 * most / np.median(sigma[inside]), LEAST_PHASES, MOST_PHASES))
-            noise = np.maximum(sigma[inside], 4.0 * most / phases)
-            grid = HopGrid(law, phases, tick=0.25 * float(noise.min()) / law.fastest)
-            spread = max(ball.level_sigma(position, height), SegmentationSettings().surface_sigma)
-            known = _known(grid, track.times[inside], gap[inside], noise, spread)
-            least = float(np.sqrt(2.0 * law.gravity * np.median(sigma[inside])))
+            grid, noise = ball.grid(position, most, sigma[inside])
+            known = _known(grid, track.times[inside], gap[inside], noise, ball.level_spread(position, height))
+            least = float(np.sqrt(2.0 * grid.law.gravity * np.median(sigma[inside])))
             found.append(LowHops(first, height, track.positions[inside, Z] - gap[inside], least, known))
     return tuple(found)
-
-
-def _hop(height: float, gravity: float) -> float:
-    """s, duration of a hop to a height in m; infinite for a ball that does not come down."""
-    return 2.0 * float(np.sqrt(2.0 * height / gravity)) if gravity > 0.0 else np.inf
 
 
 def counted(events: Segmentation, hops: Sequence[LowHops], times: Array) -> Segmentation:
@@ -178,17 +160,22 @@ def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel)
 
 def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
     """(n, 9) change per m/s of vertical velocity, for a bounce, the nearest one, that came earlier or later."""
-    states = estimate.states[hops.first : hops.last + 1]
-    before = states.copy()
-    before[:, VZ] = -np.maximum(hops.known.speed, REST_SPEED)
-    jumps = bounced(model, before) - before
+    jumps = bounce_jumps(estimate.states[hops.first : hops.last + 1], hops.known.speed, model)
     at = np.array([c.interval for c in estimate.contacts if hops.first <= c.interval < hops.last], dtype=np.int64)
     if len(at):
         counted = estimate.states[at + 1] - estimate.states[at]
         own, samples = counted[:, VZ] > REST_SPEED, np.arange(hops.first, hops.last + 1)
         nearest = np.abs(samples[:, None] - 0.5 - at).argmin(axis=1)
         used = own[nearest] & (hops.known.speed >= hops.least)
-        jumps[used] = counted[nearest][used]
+        jumps[used] = (counted / counted[:, [VZ]])[nearest][used]
+    return jumps
+
+
+def bounce_jumps(states: Array, speed: Array, model: BallModel) -> Array:
+    """(n, 9) change of states (n, 9) per m/s of vertical velocity, at a bounce with a speed (n,) in m/s."""
+    before = states.copy()
+    before[:, VZ] = -np.maximum(speed, REST_SPEED)
+    jumps = bounced(model, before) - before
     return np.asarray(jumps / jumps[:, [VZ]])
 
 
@@ -202,63 +189,17 @@ def uncounted_note(hops: Sequence[LowHops], times: Array) -> tuple[str, ...]:
     return (UNCOUNTED.format(float(times[min(unclear)])),) if unclear else ()
 
 
-class _Ball:
-    """A hopping ball whose model gives the parameters of hops, with their uncertainty."""
-
-    def __init__(self, model: BallModel, settings: Settings) -> None:
-        names = tuple(settings.coefficients)
-        self.model = augmented(model, names)
-        self.means = np.array([numbers_of(model).value(name) for name in names])
-        self.sigmas, self.process = np.array(list(settings.coefficients.values())), settings.process
-
-    def gap(self, positions: Array, height: float) -> Array:
-        """(n,) m, from the surface up to the ball, at positions (n, 3) m."""
-        return gaps(self.model, self._still(positions, self.means), height)
-
-    def level_sigma(self, position: Array, height: float) -> float:
-        """m, standard deviation of the surface's height. Args: position: (3,) m.  height: m, as declared."""
-        varied = gaps(self.model, self._varied(position), height)
-        return float(np.linalg.norm(varied[1:] - varied[0]))
-
-    def gravity(self, position: Array) -> float:
-        """m/s^2, downwards, of a ball that hangs still at a position (3,) m."""
-        return -float(acceleration(self.model, self._still(position[None], self.means))[0, Z])
-
-    def law(self, position: Array, most: float, gravity: float) -> HopLaw:
-        """Parameters of hops up to a height `most` m above a surface, at a position (3,) m."""
-        varied = self._varied(position)
-        fall = float(np.sqrt(2.0 * gravity * most))
-        known = self._rebound(varied[:1], np.array([max(fall, 2.0 * REST_SPEED)]))[0, 0]
-        speeds = HopLaw.speeds(max(fall * fall / max(float(known), 0.5 * fall), 2.0 * REST_SPEED))
-        rebound = self._rebound(varied, speeds)
-        scatter = np.sqrt(self.process.contact_velocity**2 + ((rebound[1:] - rebound[0]) ** 2).sum(axis=0))
-        slower = np.clip(rebound[0], 0.0, speeds)
-        return HopLaw(gravity, float(speeds[-1]), slower, scatter, self.process.acceleration)
-
-    def _rebound(self, states: Array, speeds: Array) -> Array:
-        """(m, k) m/s, vertical speeds after impacts with each of k speeds, for balls in m states."""
-        falling = np.repeat(states[:, None], len(speeds), axis=1)
-        falling[..., VZ] = -speeds
-        return bounced(self.model, falling.reshape(-1, falling.shape[-1]))[:, VZ].reshape(len(states), -1)
-
-    def _varied(self, position: Array) -> Array:
-        """(1 + p, 9 + p) a ball that hangs still: as is, then with each coefficient raised by its sigma."""
-        rows = np.concatenate((np.zeros((1, len(self.means))), np.diag(self.sigmas)))
-        return self._still(np.tile(position, (len(rows), 1)), self.means + rows)
-
-    @staticmethod
-    def _still(positions: Array, coefficients: Array) -> Array:
-        states = np.zeros((len(positions), STATE_DIM + coefficients.shape[-1]))
-        states[:, POSITION], states[:, STATE_DIM:] = positions, coefficients
-        return states
-
-
 def _height_sigmas(track: Track, settings: Settings) -> Array:
-    """(n,) m, noise of the heights. Lasting errors are replaced by white ones with equal information on a mean."""
+    """(n,) m, noise of the heights."""
     settings = settings.for_track(track)
     white = sample_sigmas(settings, len(track), track.sigmas)[:, 2]
-    fading = np.exp(-float(np.median(np.diff(track.times))) / settings.memory_time)
-    return np.asarray(np.sqrt(white**2 + settings.memory[2] ** 2 * (1.0 + fading) / (1.0 - fading)))
+    return as_white(white, float(np.median(np.diff(track.times))), settings)
+
+
+def as_white(sigma: Array, dt: float, settings: Settings) -> Array:
+    """m, noise of heights every dt s: lasting errors are replaced by white ones with equal information on a mean."""
+    fading = np.exp(-dt / settings.memory_time)
+    return np.asarray(np.sqrt(sigma**2 + settings.memory[2] ** 2 * (1.0 + fading) / (1.0 - fading)))
 
 
 def _runs(low: NDArray[np.bool_], events: Segmentation, unseen: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -274,12 +215,17 @@ def _runs(low: NDArray[np.bool_], events: Segmentation, unseen: NDArray[np.bool_
 
 def _known(grid: HopGrid, times: Array, gap: Array, sigma: Array, spread: float) -> HopMoments:
     """Moments of the ball's motion, averaged over the heights of the surface, which has a `spread` in m."""
-    count = int(np.ceil(WIDEST * spread / (0.5 * float(np.median(sigma)))))
-    levels = np.linspace(-WIDEST * spread, WIDEST * spread, 2 * count + 1)
+    levels = levels_within(spread, float(np.median(sigma)))
     said = grid.evidence(times, gap, sigma, levels) - 0.5 * (levels / spread) ** 2
     weights = np.exp(said - said.max())
     levels, weights = levels[weights > UNLIKELY], weights[weights > UNLIKELY]
     return averaged([grid.moments(times, gap - level, sigma) for level in levels], levels, weights / weights.sum())
+
+
+def levels_within(spread: float, sigma: float) -> Array:
+    """(k,) m, heights of a surface about its declared one, for its `spread` and the noise of samples in m."""
+    count = int(np.ceil(WIDEST * spread / (0.5 * sigma)))
+    return np.linspace(-WIDEST * spread, WIDEST * spread, 2 * count + 1)
 
 
 def _beyond(larger: Array, own: Array) -> Array:
