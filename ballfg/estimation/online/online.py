@@ -79,7 +79,8 @@ class Online(Estimator):
         solver: earlier name of the settings' solver, "isam2" or "chain"; deprecated.
         budget_ms: that a push may take, on the machine as it is when `warm_up` measures it, or the first push. States
             too old to be linearised anew within it keep their points: with a budget of a few ms spins are a tenth to
-            two fifths less accurate, positions and velocities 1 %. None: all states that moved are.
+            two fifths less accurate, positions and velocities 1 %. None: all states that moved are. The push with
+            which a ball's hops become too low to count takes 20 to 100 ms all the same.
         shown_noise: True: positions without a sigma have the noise that the stream shows, not the settings'. None: if
             neither settings nor the model's file state it. Samples from before a noise showed get it too, each at the
             cost of a push, but not with a budget: with a noise of 10 mm, velocities are then up to twice as far off as

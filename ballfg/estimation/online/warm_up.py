@@ -37,7 +37,12 @@ def warmed_up(online: "Online") -> list[OnlineState]:
     """The states before the bounce and at the end of a falling ball, estimated by a copy of an estimator."""
     trial, states = online.copy(), []
     trial.reset()
-    for k, (time, position) in enumerate(zip(*falling_ball(online), strict=True)):
+    stamps, positions = falling_ball(online)
+    lying = positions[0] - [0.0, 0.0, DROP]  # its hops may be lower than the noise
+    for time in stamps:
+        trial.push(time, lying)
+    trial.reset()
+    for k, (time, position) in enumerate(zip(stamps, positions, strict=True)):
         state = trial.push(time, position)
         if k in LOOKED_AHEAD:
             bounce = _looked_ahead(state)
