@@ -15,11 +15,13 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.measurement.position_noise import noise_doubts
 from ballfg.estimation.observations.observation import given
 from ballfg.estimation.result import Estimate
+from ballfg.estimation.segmentation.physics import physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.prediction.state import World
 from ballfg.tracks import Ball, Track
-from ballfg.tracks.checks import check_scale, doubts_about
+from ballfg.tracks.checks import check_scale
+from ballfg.tracks.doubts import doubts_about
 
 if TYPE_CHECKING:
     from ballfg.dynamics.model import BallModel
@@ -135,5 +137,6 @@ class Estimator(ABC):
 
     def doubts(self, track: Track) -> tuple[str, ...]:
         """Signs that the track is no ball above these surfaces, or noisier than stated; for `Estimate.notes`."""
-        about = doubts_about(track.times, track.positions, self.surfaces.heights(), self.model.radius)
+        levels, drag = self.surfaces.heights(), physics_of(self.model).drag
+        about = doubts_about(track.times, track.positions, levels, self.model.radius, drag)
         return (*about, *noise_doubts(track, self.settings))

@@ -4,17 +4,15 @@ Repairs: rows out of time order are sorted, exact repeats are dropped. Two diffe
 together count as one measurement with an inaccurate stamp: their mean replaces them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ballfg.arrays import Array, median
 from ballfg.checks import shown
 from ballfg.progress import counted
-from ballfg.state import STANDARD_GRAVITY, Z
 
 if TYPE_CHECKING:
     from ballfg.tracks.rows import RowGroup
@@ -28,13 +26,6 @@ MAX_MEDIAN_SIGMA = 1.0  # m: a track with a larger median sigma is refused
 MAX_STEP = 1.0  # s: a track whose median time step is longer is refused; no bounce could be seen in it
 MIN_STEP = 1e-6  # s: a track whose median time step is shorter is refused; no camera is that fast
 MAX_RATE_RATIO = 100.0  # a median time step that differs from the declared rate by more than this factor is refused
-BASELINE: Final = 0.05  # s to each side for an acceleration: 3 mm of noise leave 3 m/s^2, in a track's median 0.5
-LEAST_FALLING: Final = 0.2  # least share of a track that falls along -z as a ball does, for undoubted axes
-MOSTLY: Final = 0.5  # share of a track that falls along +z, above which z seems to point down
-FALLS: Final = (0.4, 1.9)  # gravities between which a flying ball's vertical acceleration lies; topspin doubles it
-LEAST_REVERSAL: Final = 0.8  # m/s. A ball that falls and then rises at least so fast within a few samples has bounced.
-NEAR_SURFACE: Final = 0.08  # m from every declared surface beyond which a bounce is doubtful; one step of a fast ball
-AXES: Final = ("x", "y", "z")
 
 _NAMED = 3  # number of trajectories that a note names
 
@@ -166,15 +157,6 @@ def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None
         raise ValueError(f"{rule}; got {np.median(sigmas):.4g}. The unit is probably mm: divide by 1000.")
 
 
-def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
-    """Doubts that a ball, of times (n,) s and positions (n, 3) m, falls along -z and bounces on the surfaces (m)."""
-    step = float(median(np.diff(times))) if len(times) > 1 else np.inf
-    reach = max(round(BASELINE / step), 1) if np.isfinite(step) else 1
-    if len(times) < 4 * reach:
-        return ()
-    return (*_other_axis(times, positions, reach), *_other_surface(times, positions, reach, surfaces, radius))
-
-
 def _one_per_stamp(group: "RowGroup", where: Where, findings: Findings) -> Array:
     values = group.values
     starts = np.flatnonzero(np.concatenate([[True], np.diff(values[:, 0]) != 0]))
@@ -212,41 +194,3 @@ def _time_remedy(step: float, rate: float | None) -> str:
 def _some(names: list[str]) -> str:
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _other_axis(times: Array, positions: Array, reach: int) -> tuple[str, ...]:
-    before, middle, after = positions[: -2 * reach], positions[reach:-reach], positions[2 * reach :]
-    span = (times[2 * reach :] - times[: -2 * reach]) / 2
-    accelerations = (after - 2 * middle + before) / span[:, None] ** 2
-    acceleration = median(accelerations)
-    low, high = FALLS[0] * STANDARD_GRAVITY, FALLS[1] * STANDARD_GRAVITY
-    falls = (-high <= accelerations[:, Z]) & (accelerations[:, Z] <= -low)
-    rises = (low <= accelerations[:, Z]) & (accelerations[:, Z] <= high)
-    if falls.mean() >= LEAST_FALLING:  # in a short track a bounce outweighs its flights in the median
-        return ()
-    if rises.mean() >= MOSTLY:
-        return ("the ball rises faster and faster along z: z seems to point down. Turn the sign of z.",)
-    other = int(np.abs(acceleration[:2]).argmax())
-    if abs(acceleration[Z]) >= low / 2 or not low <= abs(acceleration[other]) <= high:
-        return ()
-    return (f"the ball falls along {AXES[other]}, not along z: exchange the axes so that z points up.",)
-
-
-def _other_surface(
-    times: Array, positions: Array, reach: int, surfaces: Sequence[float], radius: float
-) -> tuple[str, ...]:
-    z = positions[:, Z]
-    inner = np.arange(reach, len(z) - reach)
-    last, first = inner - (reach > 1), inner + (reach > 1)  # without the lowest sample itself, which may be an outlier
-    fall = (z[last] - z[inner - reach]) / (times[last] - times[inner - reach])
-    rise = (z[inner + reach] - z[first]) / (times[inner + reach] - times[first])
-    lowest = z[inner] == sliding_window_view(z, 2 * reach + 1).min(axis=1)
-    bounces = z[inner[lowest & (fall < -LEAST_REVERSAL) & (rise > LEAST_REVERSAL)]] - radius
-    gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1, initial=np.inf)
-    if not len(bounces) or not len(surfaces) or median(gaps) <= NEAR_SURFACE:
-        return ()
-    heights = " and ".join(f"{height:g}" for height in surfaces)
-    return (
-        f"the ball bounces at z = {np.median(bounces):.2f} m, where no surface is declared (they are at {heights} m). "
-        "Correct the table's height.",
-    )
