@@ -104,7 +104,7 @@ def test_a_search_that_steps_too_far_comes_back(linear, monkeypatch):
     """Rounding leaves no density where the first step leads to: the search ends where it would have ended anyway."""
     tracks, calls = LinearFilter(linear, 10.0, biased=True), []
     parameters = parameters_of(Settings(), linear, position_known=False)
-    free, whole = MarginalFit(tracks, Settings(), parameters, tolerance=0.01, most=80), LinearFilter.losses
+    free, whole = MarginalFit(tracks, Settings(), parameters, tolerance=0.001, most=200), LinearFilter.losses
 
     def losses(self, noise):
         calls.append(1)
@@ -113,7 +113,7 @@ def test_a_search_that_steps_too_far_comes_back(linear, monkeypatch):
         return whole(self, noise)
 
     monkeypatch.setattr(LinearFilter, "losses", losses)
-    again = MarginalFit(tracks, Settings(), parameters, tolerance=0.01, most=80)
+    again = MarginalFit(tracks, Settings(), parameters, tolerance=0.001, most=200)
     assert len(calls) > 4
     begin = free.at(free.start)[0].sum()
     assert begin - again.losses.sum() == pytest.approx(begin - free.losses.sum(), rel=0.02)
