@@ -40,10 +40,15 @@ class _Number(float):
         if spec.startswith("abs "):
             return format(abs(float(self)), spec.removeprefix("abs "))
         if spec in ("points", "%"):
-            return f"{100 * abs(self):.2g}{' %' if spec == '%' else ''}"
+            return f"{_short(100 * abs(self))}{' %' if spec == '%' else ''}"
         if spec == "milli":
-            return f"{1e3 * abs(self):.2g}"
-        return f"{100 * -math.expm1(-self):.2g} %" if spec == "lost" else format(float(self), spec)
+            return _short(1e3 * abs(self))
+        return f"{_short(100 * -math.expm1(-self))} %" if spec == "lost" else format(float(self), spec)
+
+
+def _short(number: float) -> str:
+    """Two digits, or all before the point."""
+    return f"{number:.0f}" if number >= 99.5 else f"{number:.2g}"
 
 
 @dataclass(frozen=True)

@@ -204,8 +204,8 @@ class TimeScale(MeasurementEffect):
         "the spin, are free."
     )
     decide = "Film a clock, or trust the local g: gravity then gives the scale of the time."
-    coefficients = (Coefficient("s", 0.0, 0.01, "1", -0.9, 0.9),)
-    plausible = Range(-0.8, 0.9, "cameras of 30 to 240 Hz taken for one another")
+    coefficients = (Coefficient("s", 0.0, 0.01, "1", -0.9, 9.0),)
+    plausible = Range(-0.88, 7.0, "cameras of 30 to 240 Hz taken for one another")
     usual = Usual({"s": 0.01}, "an estimate: 1 %")
     rank = 100
 

@@ -61,18 +61,23 @@ def test_counted_frames_are_held_where_a_clock_is_fitted(found: tuple[str, ...],
     )
 
 
-def test_the_first_fit_finds_how_far_the_clock_is_off(make_ball, make_launches, make_shots, tmp_path: Path) -> None:
-    clock = {"s": 0.3}
+@pytest.mark.parametrize(("s", "words"), [(0.3, "30 %"), (1.0, "100 %")])
+def test_the_first_fit_finds_how_far_the_clock_is_off(
+    make_ball, make_launches, make_shots, tmp_path: Path, s: float, words: str
+) -> None:
+    clock = {"s": s}
     written = make_shots(make_ball(time_scale=clock), make_launches(16, 3), 3).stretches
-    stamps = Stamps(scale=0.27, found={"time_scale": EACH})  # as the fall of the balls tells it, roughly
+    stamps = Stamps(
+        scale=0.97 * (1.0 + s) - 1.0, found={"time_scale": EACH}
+    )  # as the fall of the balls tells it, roughly
     write_simulation(tmp_path / "any", SimulationConfig(tracks=6, rate=60.0, seed=3))
     holdout = hold_out(read_dataset(tmp_path / "any"), make_ball(), 1, lambda line: None)
     fit = first_fit(make_ball(), replace(holdout, search=written, stamps=stamps))
     (free,) = (name for name in fit.problem.free if name.endswith("time_scale.s"))
-    assert fit.unknowns.values[free] == pytest.approx(0.3, abs=0.01)
+    assert fit.unknowns.values[free] == pytest.approx(s, abs=0.01)
     (finding,) = stamp_findings(fit, stamps, fit)
     assert finding.parameters["s"].value == fit.unknowns.values[free]
-    assert in_plain_words(finding) == "The clock is wrong: durations are written 30 % too long."
+    assert in_plain_words(finding) == f"The clock is wrong: durations are written {words} too long."
     assert (finding.name, finding.kind, finding.p_value) == ("time_scale", "measurement", 1e-9)
     assert (finding.held_out_gain, finding.held_out_p) == (0.6, 1e-5)
     assert finding.delta_bic == pytest.approx(math.log(16) - 2.0 * 16 * 0.8)

@@ -118,7 +118,7 @@ def test_an_effect_of_measurement_belongs_to_the_rig() -> None:
 @pytest.mark.parametrize(
     ("says", "expected"),
     [
-        ("{x:.3f} {x:abs .1f} {x:points} {x:%} {x:milli}", "-0.300 0.3 30 30 % 3e+02"),
+        ("{x:.3f} {x:abs .1f} {x:points} {x:%} {x:milli}", "-0.300 0.3 30 30 % 300"),
         ("{x:up|down} {y:up|down} {z:up|down}", "down up up"),
         ("{size:.2g} {direction} {apart:.2g} {degrees}", "0.5 with x -0.3, y 0.4, z 0 0.7 29°"),
         ("{axes:long|short}", "30 % too short along x, 40 % too long along y"),
