@@ -39,7 +39,7 @@ class Arc:
     def states(self, times: Tensor) -> Tensor:
         """(k, m, 9) states at times (k, m) s; beyond the last node by the last polynomial."""
         place = (times - self.begun) / self.step[:, 0]
-        index = place.detach().floor().clamp(0, len(self.nodes) - 2).long()
+        index = place.detach().nan_to_num(nan=0.0).floor().clamp(0, len(self.nodes) - 2).long()
         theta = (place - index).unsqueeze(-1)
         where = index.unsqueeze(-1).expand(-1, -1, self.nodes.shape[-1])
         ends = (a.gather(0, where + j) for j in (0, 1) for a in (self.nodes, self.slopes))
@@ -100,11 +100,14 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
 
 
 def steps_of_arc(state: Tensor, duration: Tensor) -> tuple[int, Tensor]:
-    """Number of equal steps for arcs of durations (m,) s from states (m, 9), and their lengths (m,) s."""
+    """Number of equal steps for arcs of durations (m,) s from states (m, 9), and their lengths (m,) s.
+
+    Rows that missed a contact have no duration and do not count.
+    """
     duration = duration.clamp_min(LEAST_ARC)
     fastest = float(state[:, VELOCITY].detach().square().sum(-1).nan_to_num(nan=0.0).max().sqrt())
     longest = min(LONGEST_STEP, max(MAX_STEP, LONGEST_WAY / max(fastest, 1.0)))
-    count = max(1, math.ceil(float(duration.max()) / longest))
+    count = max(1, math.ceil(float(duration.nan_to_num(nan=LEAST_ARC).max()) / longest))
     return count, duration / count
 
 

@@ -101,3 +101,14 @@ def test_a_ball_that_never_comes_down_is_nan_from_there_on_and_alone(model, stat
     assert bool(moved[0].isfinite().all())
     assert moved[1].isnan().any(-1).tolist() == [i == 2 for i in range(len(states))]
     assert bool(motion.contacts[2].isnan().all())
+
+
+def test_a_row_that_was_never_known_to_come_down_is_nan_and_alone(model, states, stretches):
+    """It has no time to shoot for: the motion about which it was linearised had missed its surface."""
+    unknown = stretches.contacts.clone()
+    unknown[2] = torch.nan
+    asked = torch.tensor((0.05, 1.05), dtype=torch.float64).unsqueeze(1).expand(-1, len(states))
+    found, whole = (shot(model, states, stretches, times).states(asked) for times in (unknown, stretches.contacts))
+    assert bool(found[1, 2].isnan().all())
+    others = [i for i in range(len(states)) if i != 2]
+    torch.testing.assert_close(found[:, others], whole[:, others], rtol=0, atol=1e-6)
