@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, frame_of
 from ballfg.checks import check_instance
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.factors.linear.definite import joint_covariance
@@ -233,9 +233,7 @@ class Estimate:
 
         Raises: ImportError: without pandas.
         """
-        import pandas
-
-        return pandas.DataFrame(self.columns)
+        return frame_of(self.columns)
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:

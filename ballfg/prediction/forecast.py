@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, frame_of
 from ballfg.checks import check_number, check_text
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
@@ -130,10 +130,8 @@ class Forecast:
 
         Raises: ImportError: without pandas.
         """
-        import pandas
-
         columns = {"t": self.times, **dict(zip(AXES, self.positions.T, strict=True))}
-        return pandas.DataFrame(columns | {f"sigma_{a}": s for a, s in zip(AXES, self.sigmas.T, strict=True)})
+        return frame_of(columns | {f"sigma_{a}": s for a, s in zip(AXES, self.sigmas.T, strict=True)})
 
     def plot(self) -> "Figure":
         """A picture of x, y and z over time, each with the band that holds 90 %; without measurement noise."""

@@ -26,7 +26,7 @@ def test_tables(estimate: bf.Estimate) -> None:
 @pytest.mark.skipif(PANDAS, reason="pandas is installed")
 def test_tables_need_pandas(estimate: bf.Estimate) -> None:
     for shown in (estimate, estimate.predict(0.1)):
-        with pytest.raises(ImportError, match="pandas"):
+        with pytest.raises(ImportError, match="Install it: pip install pandas"):
             shown.to_frame()
 
 
