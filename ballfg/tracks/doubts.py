@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ballfg.arrays import Array, median
+from ballfg.arrays import MAD_TO_SIGMA, Array, median, quadratics
 from ballfg.state import STANDARD_GRAVITY, Z
 
 BASELINE: Final = 0.05  # s to each side for an acceleration: 3 mm of noise leave 3 m/s^2, in a track's median 0.5
@@ -14,7 +14,9 @@ LEAST_FALLING: Final = 0.2  # least share of a track that falls along -z as a ba
 MOSTLY: Final = 0.5  # share of a track that falls along +z, above which z seems to point down
 FALLS: Final = (0.4, 1.9)  # gravities between which a flying ball's vertical acceleration lies; topspin doubles it
 LEAST_FALL: Final = 0.1  # gravities. A ball that falls more slowly rolls, lies still or is held
-LEAST_OFF: Final = 0.5  # gravities by which that of a doubtful clock or unit differs, beside what air can do
+LEAST_OFF: Final = 0.5
+"""Gravities by which that of a doubtful clock or unit differs, beside what air can do: with 0.3 a track of
+`robot_rallies` was doubted; `strokes`, `spindoe`, `aimy`, `ballgun` are silent with either."""
 ALIKE: Final = 0.7  # least share of the windows that fall about alike, as no hand moves a ball
 QUIET: Final = 2.0  # times the residual of a quarter of the windows, up to which another has no bounce
 MOST_LIFT: Final = 1.5  # times the drag: what air adds to the vertical acceleration at most
@@ -66,12 +68,9 @@ def _other_clock(times: Array, positions: Array, reach: int, drag: float) -> tup
     size = 4 * reach + 1
     stamps = sliding_window_view(times, size)[::reach]
     ways = sliding_window_view(positions, size, axis=0)[::reach].swapaxes(1, 2)
-    scale = 0.5 * (stamps[:, -1:] - stamps[:, :1])
-    basis = ((stamps - stamps.mean(axis=1, keepdims=True)) / scale)[..., None] ** np.arange(3)
-    found = np.linalg.solve(basis.swapaxes(1, 2) @ basis, basis.swapaxes(1, 2) @ ways)
-    left = ((ways - basis @ found) ** 2).sum(axis=(1, 2))
-    quiet = left <= QUIET**2 * np.percentile(left, 25.0)  # without a bounce or a hit
-    falls, velocities = -2.0 * found[quiet, 2, Z] / scale[quiet, 0] ** 2, found[quiet, 1] / scale[quiet]
+    found, variances = quadratics(stamps, ways)
+    quiet = variances <= QUIET**2 * np.percentile(variances, 25.0)  # without a bounce or a hit
+    falls, velocities = -2.0 * found[quiet, 0, Z], found[quiet, 1]
     fall, air = float(median(falls)), MOST_LIFT * drag * float(median((velocities**2).sum(axis=1)))
     alike = ((0.5 * fall < falls) & (falls < 2.0 * fall)).mean()
     off = abs(fall - STANDARD_GRAVITY) - air
@@ -89,7 +88,8 @@ def _other_surface(
     contacts, within = _contacts(times, heights, reach)
     if not len(contacts):
         return ()
-    bounced = f"the ball bounces at z = {median(contacts) - radius:.2f} m"
+    height = round(float(median(contacts)) - radius, 2) + 0.0  # no minus sign before a zero
+    bounced = f"the ball bounces at z = {height:.2f} m"
     if not len(surfaces):
         low, high = np.percentile(contacts, (25.0, 75.0))
         if len(contacts) < LEAST_BOUNCES or high - low > NEAR_SURFACE:
@@ -114,8 +114,8 @@ def _contacts(times: Array, z: Array, reach: int) -> tuple[Array, Array]:
     before, after = times[last] - times[inner - reach], times[inner + reach] - times[first]
     fall = (z[last] - z[inner - reach]) / before - 0.5 * STANDARD_GRAVITY * before
     rise = (z[inner + reach] - z[first]) / after + 0.5 * STANDARD_GRAVITY * after
-    third = np.abs(np.diff(z, 3))
-    noise = float(median(third)) / (0.6745 * np.sqrt(20.0))  # the third difference of white noise has variance 20
+    third = float(median(np.abs(np.diff(z, 3))))
+    noise = MAD_TO_SIGMA * third / np.sqrt(20.0)  # the third difference of white noise has 20 times its variance
     least = LEAST_REVERSAL + SURELY * noise * np.sqrt(2.0) / (reach * float(median(np.diff(times))))
     lowest = z[inner] == sliding_window_view(z, 2 * reach + 1).min(axis=1)
     found = lowest & (fall < -least) & (rise > least)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
-from ballfg.arrays import Array, Index
+from ballfg.arrays import Array, Index, quadratics
 from ballfg.estimation.measurement.position_noise import FLOOR
 from ballfg.tracks import Track
 
@@ -140,7 +140,7 @@ def _changes(numbers: Index, positions: Array, quiet: float) -> Index:
         inside = first[:, None] + np.arange(WINDOW)
         for row, change in zip(costs, tried, strict=True):
             moved = numbers[inside] + change * (inside > steps[:, None])
-            np.minimum(row, _quadratics(moved.astype(np.float64), positions[inside])[1], out=row)
+            np.minimum(row, quadratics(moved.astype(np.float64), positions[inside])[1], out=row)
     freedom = 3.0 * (WINDOW - 3)
     share = np.clip(1.0 - len(steps) / numbers[-1], LEAST_SHARE, 0.9)
     unclear = costs[2] > CLEAR * costs[0]  # a bounce stays a kink whatever is counted
@@ -152,25 +152,12 @@ def _changes(numbers: Index, positions: Array, quiet: float) -> Index:
     return np.where((gain > 0.0) & (gain == most), np.array(tried)[best], 0)
 
 
-def _quadratics(times: Array, positions: Array) -> tuple[Array, Array]:
-    """(w, 3, 3) coefficients of quadratics, highest power first, and (w,) m^2 variances about them.
-
-    Args: times: (w, m) s, counted from the middle of each window.  positions: (w, m, 3) m.
-    """
-    basis = np.stack([(times - times.mean(axis=1, keepdims=True)) ** power for power in (2, 1, 0)], axis=-1)
-    basis /= (scale := np.abs(basis).max(axis=1, keepdims=True))
-    found = np.linalg.solve(basis.swapaxes(-1, -2) @ basis, basis.swapaxes(-1, -2) @ positions)
-    left = positions - basis @ found
-    variance = (left**2).sum(axis=(1, 2)) / (3.0 * (times.shape[1] - 3))
-    return found / scale.swapaxes(-1, -2), np.maximum(variance, TINY**2)
-
-
 def _pieces(times: Array, positions: Array) -> tuple[Array, Array]:
-    """Quadratics through windows of samples, by `_quadratics`; none for a track that is too short."""
+    """Quadratics through windows of samples, by `quadratics`; none for a track that is too short."""
     if len(times) < WINDOW:
         return np.zeros((0, 3, 3)), np.zeros(0)
     windows = sliding_window_view(times, WINDOW)[:: WINDOW // 4]
-    return _quadratics(windows, sliding_window_view(positions, WINDOW, axis=0)[:: WINDOW // 4].swapaxes(-1, -2))
+    return quadratics(windows, sliding_window_view(positions, WINDOW, axis=0)[:: WINDOW // 4].swapaxes(-1, -2))
 
 
 def _across(track: Track) -> float:

@@ -6,7 +6,7 @@ from typing import Any, Final
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, several
 from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SCENE, Record
-from ballfg.estimation.segmentation.surface_contact import air, carry, transform
+from ballfg.estimation.segmentation.surface_contact import carry, slack_spread, transform
 
 HANDLED: Final = 1  # Value of `surface` for a ball that a hand moves quickly: throws, catches, pushes
 CARRIED: Final = 2  # For a ball that a hand moves slowly
@@ -24,7 +24,8 @@ SHORT: Final = 0.02
 """Time constants up to which a series is exact to 2 % and better than differences of rounded numbers."""
 PULLS: Final = (0.0, 30.0, 8.0, 1.0, 0.3, 0.0)
 """m/s^2. Spread of the acceleration, per axis, by mode: of a hand that throws or catches, of one that carries, of one
-that holds the ball, of a rolling ball along the ground; none of a ball that does not move. `air` is that of flight."""
+that holds the ball, of a rolling ball along the ground; none of a ball that does not move, `slack_spread` in
+flight."""
 MEMORIES: Final = (0.0, 0.08, 0.15, 0.3)  # s. Time constants of the accelerations of hands, by mode
 STOPPING: Final = 120.0  # m/s^2. Spread of the acceleration at the start of a catch
 HAND_SPEED: Final = 2.0  # m/s. Spread of the velocity of a hand, per axis
@@ -117,7 +118,7 @@ def enter(h: Record, mode: int, scene: Record) -> None:
         h.age = 0
     for axis in range(3):
         if mode == FLYING:
-            _forget(h, axis, 2, 0.0, air(h, scene))
+            _forget(h, axis, 2, 0.0, slack_spread(h, scene))
         elif mode <= SWAYED or (mode == ROLLING and axis < 2):
             _forget(h, axis, 2, 0.0, STOPPING if mode == HANDLED and before == FLYING else PULLS[mode])
         else:
@@ -171,5 +172,5 @@ def bounce(h: Record, dt: float, scene: Record) -> bool:
         h.mean[axis, 1] *= KEPT
         h.cov[axis, 1, 1] += (SLIDE * fall + BOUNCE_JITTER) ** 2
     for axis in range(3):
-        h.cov[axis, 2, 2] += air(h, scene) ** 2
+        h.cov[axis, 2, 2] += slack_spread(h, scene) ** 2
     return True

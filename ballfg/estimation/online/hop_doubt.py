@@ -6,7 +6,6 @@ the samples as well, and the ball may be on either side of any bounce. A grid of
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
@@ -39,7 +38,10 @@ class _Low:
 
 
 class HopDoubt:
-    """Follows a ball that is low over one surface for longer than a hop as high takes. Args: owner: the estimator."""
+    """Follows a ball that is low over one surface for longer than a hop as high takes; nothing is changed in place.
+
+    Args: owner: the estimator.
+    """
 
     def __init__(self, owner: Online) -> None:
         self.model, self.settings = owner.model, owner.settings
@@ -52,10 +54,6 @@ class HopDoubt:
         self._belief: HopBelief | None = None
         self._apart = 0.0  # m, between heights of the surface
 
-    def copy(self) -> HopDoubt:
-        """The same, which further samples leave as it is."""
-        return copy.copy(self)  # nothing is changed in place
-
     def after(self, state: OnlineState, sample: Sample) -> OnlineState:
         """The state after a sample; in low hops, its height and vertical velocity over all arrangements of bounces."""
         if not sample.measured or not sample.motion.linked or sample.motion.hit:
@@ -64,7 +62,7 @@ class HopDoubt:
         self._follow(sample)
         if self._belief is None:
             return state
-        rests = float(self._belief.moments().resting[0])
+        rests = self._belief.resting
         if rests > 1.0 - MILLIONTH:
             return state
         own = state.mean[VERTICAL], state.joint[np.ix_(VERTICAL, VERTICAL)]
@@ -119,12 +117,12 @@ class HopDoubt:
     def _begin(self, sample: Sample, most: float) -> None:
         """Begins the grid with the low samples so far, the last of which is given."""
         ball, surface = HoppingBall(self.model, self.settings), self._low[0].surface
-        grid, _ = ball.grid(sample.position, most, np.array([low.noise for low in self._low]))
+        grid = ball.grid(sample.position, most, np.array([low.noise for low in self._low]))
         spread = ball.level_spread(sample.position, surface)
         levels = levels_within(spread, max(sample.stated[2], LEAST_NOISE))
         self._apart = float(levels[1] - levels[0])
         belief = replace(grid.unknown(levels), said=-0.5 * (levels / spread) ** 2)
-        belief = belief.weighed(self._low[0].gap, max(self._low[0].noise, grid.finest))
+        belief = belief.weighed(self._low[0].gap, self._low[0].noise)
         for last, low in pairwise(self._low):
             belief = _after(belief, last, low)
         self._belief, self._low = belief, self._low[-1:]
@@ -143,4 +141,4 @@ def _with_vertical(state: OnlineState, mean: Array, spread: Array, jump: Array) 
 def _after(belief: HopBelief, last: _Low, low: _Low) -> HopBelief:
     """What is known after one more low sample."""
     ticks = max(round((low.time - last.time) / belief.grid.tick), 1)
-    return belief.moved(ticks).weighed(low.gap, max(low.noise, belief.grid.finest))
+    return belief.moved(ticks).weighed(low.gap, low.noise)

@@ -59,7 +59,7 @@ class Newest:
         """The same, which further samples leave as it is."""
         other = copy.copy(self)
         other.monitor, other.hit = copy.copy(self.monitor), copy.copy(self.hit)
-        other.rest, other.first, other.hops = copy.copy(self.rest), copy.copy(self.first), self.hops.copy()
+        other.rest, other.first, other.hops = copy.copy(self.rest), copy.copy(self.first), copy.copy(self.hops)
         return other
 
     def after(

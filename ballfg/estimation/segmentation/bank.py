@@ -126,13 +126,13 @@ NUMBERS: Final = np.dtype(
     [
         *((one.name, np.float64) for one in (*fields(SegmentationPhysics), *fields(SegmentationSettings))),
         ("log_shares", np.float64, (3,)),
-        ("drift", np.float64, (3, 3, 3)),
+        ("drift", np.float64, (3, 2, 2)),
         ("extent", np.float64, (4,)),
     ]
 )
 """The fields of `SegmentationPhysics` and of `SegmentationSettings` in their units, and derived numbers.
 
-- log_shares: log prior of good, wide and outlying samples.  drift: process noise of (p, v, b) per dt, dt^2, dt^3.
+- log_shares: log prior of good, wide and outlying samples.  drift: process noise of (p, v) per dt, dt^2, dt^3.
 - extent: m, (x low, x high, y low, y high) within which a contact with the table is tried.
 """
 SCENE: Final[Any] = from_dtype(NUMBERS)
@@ -143,7 +143,7 @@ class Scene:
 
     def __init__(self, physics: SegmentationPhysics, surfaces: Surfaces, settings: SegmentationSettings) -> None:
         self.surfaces, self.settings, self.physics = surfaces, settings, physics
-        s, drift = settings, np.zeros((3, 3, 3))
+        s, drift = settings, np.zeros((3, 2, 2))
         drift[2, 0, 0], drift[1, 0, 1], drift[0, 1, 1] = white_acceleration(1.0, s.velocity_drift**2)
         drift[1, 1, 0] = drift[1, 0, 1]
         shares = np.log([1.0 - s.wide_share - s.outlier_share, s.wide_share, s.outlier_share])

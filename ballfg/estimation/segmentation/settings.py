@@ -34,7 +34,7 @@ class SegmentationSettings:
     still_air: float = 0.7
     """m/s^2. Its spread for a slow ball, which no air can hold up."""
     air_growth: float = 0.45
-    """Growth of this spread, over the ball's own drag: lift of a spinning ball."""
+    """Growth of this spread, over the ball's own drag: lift of a spinning ball. `strokes` and `spindoe` judged it."""
     air_memory: float = 0.5
     """s. Time constant within which the slack forgets itself."""
     velocity_drift: float = 0.05

@@ -58,46 +58,38 @@ MOST_AIR: Final = 30.0
 
 
 @machine_code(REAL(bank.ONE_HYPOTHESIS, bank.SCENE))
-def air(h: bank.Record, scene: bank.Record) -> float:
-    """m/s^2, spread of the slack acceleration of a flying ball: spin and wind act with the air."""
+def slack_spread(h: bank.Record, scene: bank.Record) -> float:
+    """m/s^2, spread of the slack acceleration: spin and wind act with the air, friction on a surface."""
+    if h.surface != bank.FLYING:
+        return scene.friction * scene.gravity
     squared = h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2
     return min(scene.still_air + scene.air_growth * scene.drag * squared, MOST_AIR)
-
-
-@machine_code(NOTHING(bank.ONE_HYPOTHESIS, REAL, bank.SCENE))
-def _relax(h: bank.Record, t: float, scene: bank.Record) -> None:
-    """The slack forgets itself within t s; that of a ball on a surface is friction."""
-    flying = h.surface == bank.FLYING
-    memory, spread = math.exp(-t / scene.air_memory), air(h, scene) if flying else scene.friction * scene.gravity
-    for axis in range(3 if flying else 2):
-        h.mean[axis, 2] *= memory
-        for k in range(3):
-            h.cov[axis, 2, k] *= memory
-            h.cov[axis, k, 2] *= memory
-        h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
 
 
 @machine_code(NOTHING(bank.ONE_HYPOTHESIS, REAL, bank.SCENE))
 def carry(h: bank.Record, t: float, scene: bank.Record) -> None:
     """A hypothesis t s later, without an event: a flying ball flies, a resting one stays down; changes `h`.
 
-    Drag is linearised at the present speed, equal on the three axes: v' = (1 - k |v| dt) v + (b - g) dt. Negative steps
-    go back, and add noise like positive ones.
+    Drag is linearised at the present speed, equal on the three axes: v' = (1 - k |v| dt) v + (b - g) dt. The slack b
+    forgets itself. Negative steps go back, and add noise like positive ones.
     """
     step, half = abs(t), 0.5 * t * t
     speed = math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
     loss = min(max(scene.drag * speed * t, -STRONGEST_DRAG), STRONGEST_DRAG)
-    a, b = t * (1.0 - 0.5 * loss), 1.0 - loss
-    for axis in range(3 if h.surface == bank.FLYING else 2):
-        transform(h, axis, a, half, b, t, 1.0)
+    a, b, memory = t * (1.0 - 0.5 * loss), 1.0 - loss, math.exp(-step / scene.air_memory)
+    axes = 3 if h.surface == bank.FLYING else 2
+    for axis in range(axes):
+        transform(h, axis, a, half, b, t, memory)
         mean, cov = h.mean[axis], h.cov[axis]
-        for i in range(3):
-            for k in range(3):
+        for i in range(2):
+            for k in range(2):
                 cov[i, k] += step * (scene.drift[0, i, k] + step * (scene.drift[1, i, k] + step * scene.drift[2, i, k]))
         if axis == 2:
             mean[0] -= scene.gravity * half
             mean[1] -= scene.gravity * t
-    _relax(h, step, scene)
+    spread = slack_spread(h, scene)
+    for axis in range(axes):
+        h.cov[axis, 2, 2] += spread * spread * (1.0 - memory * memory)
 
 
 @machine_code(NOTHING(bank.ONE_HYPOTHESIS, COUNT, bank.SCENE, bank.SURFACES))
@@ -114,7 +106,7 @@ def put_down(h: bank.Record, surface: int, scene: bank.Record, surfaces: bank.Re
         h.mean[axis, 2] = 0.0
         for k in range(3):
             h.cov[axis, 2, k] = h.cov[axis, k, 2] = 0.0
-        h.cov[axis, 2, 2] = (scene.friction * scene.gravity) ** 2
+        h.cov[axis, 2, 2] = slack_spread(h, scene) ** 2
         h.cov[axis, 1, 1] += LANDING_SIGMA**2
 
 
@@ -124,7 +116,7 @@ def lift(h: bank.Record, scene: bank.Record) -> None:
     h.surface = bank.FLYING
     h.cov[2, 1, 1] += scene.leave_speed**2
     for axis in range(3):
-        h.cov[axis, 2, 2] += air(h, scene) ** 2
+        h.cov[axis, 2, 2] += slack_spread(h, scene) ** 2
 
 
 SLOWEST_CLOSING: Final = 0.2
@@ -273,4 +265,4 @@ def _bounce(h: bank.Record, surface: bank.Record, scene: bank.Record) -> None:
     h.cov[2, 0, 0] += ((1.0 + e) * scene.surface_sigma) ** 2
     h.cov[2, 1, 1] += (BOUNCE_JITTER + surface.restitution_sigma * speed) ** 2
     for axis in range(3):
-        h.cov[axis, 2, 2] += air(h, scene) ** 2
+        h.cov[axis, 2, 2] += slack_spread(h, scene) ** 2

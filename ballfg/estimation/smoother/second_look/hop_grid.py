@@ -165,7 +165,8 @@ class HopGrid:
         return _moments(cells @ self._features, np.zeros(len(cells) - 1))
 
     def likelihood(self, heights: Array | float, sigma: float) -> Array:
-        """(..., k) density of samples at heights (...) m in each cell."""
+        """(..., k) density of samples at heights (...) m in each cell; of a noise that the cells resolve."""
+        sigma = max(sigma, self.finest)
         off = (np.asarray(heights)[..., None] - self.height) / sigma
         good = (1.0 - STRAY_SHARE) * np.exp(-0.5 * off**2) / sigma
         return np.asarray(good + STRAY_SHARE / STRAY_SPREAD)
@@ -245,6 +246,17 @@ class HopBelief:
         """Some ticks later."""
         return replace(self, cells=self.cells @ self.grid.step(ticks)[0])
 
+    @property
+    def weights(self) -> Array:
+        """(k,) probabilities of the levels."""
+        weights = np.exp(self.said - self.said.max())
+        return np.asarray(weights / weights.sum())
+
+    @property
+    def resting(self) -> float:
+        """Probability that the ball lies still."""
+        return float(self.weights @ self.cells[:, -1])
+
     def moving(self) -> "HopBelief":
         """What is known if the ball does not lie still."""
         moves = self.cells[:, :-1].sum(axis=1)
@@ -258,9 +270,8 @@ class HopBelief:
     def moments(self) -> HopMoments:
         """The moments of one moment, averaged over the levels."""
         by_level = self.grid.moments_of(self.cells)
-        weights = np.exp(self.said - self.said.max())
         each = [by_level.select(slice(k, k + 1)) for k in range(len(self.levels))]
-        return averaged(each, self.levels, weights / weights.sum())
+        return averaged(each, self.levels, self.weights)
 
 
 def _moments(known: Array, bounces: Array) -> HopMoments:

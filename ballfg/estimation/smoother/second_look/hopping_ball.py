@@ -63,13 +63,13 @@ class HoppingBall:
         """m, the same, but no less than the error of any surface."""
         return max(self.level_sigma(position, height), SegmentationSettings().surface_sigma)
 
-    def grid(self, position: Array, most: float, sigma: Array) -> tuple[HopGrid, Array]:
-        """The grid of hops up to `most` m at a position (3,) m, and the noise (n,) m that it can resolve of sigma."""
+    def grid(self, position: Array, most: float, sigma: Array) -> HopGrid:
+        """The grid of hops up to `most` m at a position (3,) m, for samples with the noise sigma (n,) m."""
         law = self.law(position, most, self.gravity(position))
         phases = int(np.clip(4.0 * most / np.median(sigma), LEAST_PHASES, MOST_PHASES))
         finest = 4.0 * most / phases
-        noise = np.maximum(sigma, finest)
-        return HopGrid(law, phases, 0.25 * float(noise.min()) / law.fastest, finest), noise
+        tick = 0.25 * max(float(sigma.min()), finest) / law.fastest
+        return HopGrid(law, phases, tick, finest)
 
     def law(self, position: Array, most: float, gravity: float) -> HopLaw:
         """Parameters of hops up to a height `most` m above a surface, at a position (3,) m."""

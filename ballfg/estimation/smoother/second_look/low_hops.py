@@ -114,8 +114,8 @@ def low_hops(
             position, inside = track.positions[first], slice(first, last + 1)
             if track.times[last] - track.times[first] <= hop_time(most, ball.gravity(position)):
                 continue
-            grid, noise = ball.grid(position, most, sigma[inside])
-            known = _known(grid, track.times[inside], gap[inside], noise, ball.level_spread(position, height))
+            grid, spread = ball.grid(position, most, sigma[inside]), ball.level_spread(position, height)
+            known = _known(grid, track.times[inside], gap[inside], np.maximum(sigma[inside], grid.finest), spread)
             least = float(np.sqrt(2.0 * grid.law.gravity * np.median(sigma[inside])))
             found.append(LowHops(first, height, track.positions[inside, Z] - gap[inside], least, known))
     return tuple(found)
