@@ -9,11 +9,12 @@ import numpy as np
 from ballfg.checks import check_range
 from ballfg.diagnosis.error_budget import budget_of
 from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
+from ballfg.diagnosis.fit.free import OWN_AIR, spread
 from ballfg.diagnosis.fit.holdout import Holdout, analytic, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.generic_test import ALARM, APART, PREDICTED, GenericTest, LabelCheck
-from ballfg.diagnosis.report.wording import sentence
+from ballfg.diagnosis.report.wording import sentence, sized
 from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test
 from ballfg.diagnosis.residual_tests.label_check import check_labels, label_test
 from ballfg.diagnosis.residual_tests.residuals import residuals_of
@@ -130,7 +131,10 @@ def told(
     """
     verdict, unexplained = verdict_of(search, tests), what_is_left(tests, helped)
     given = {name: float(value.detach()) for name, value in declared.named_parameters()}
-    calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in given], given)
+    calibrated = {
+        name: replace(value, sigma=search.sigmas.get(name, value.sigma))
+        for name, value in values_of(search.whole, [n for n in search.whole.problem.free if n in given], given).items()
+    }
     residuals = residuals_of(search.first)
     return Diagnosis(
         dataset=dataset,
@@ -148,7 +152,7 @@ def told(
         model=corrected if helped is None else helped.model,
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
-        remarks=tuple(strange(search.whole, calibrated, declared.radius)),
+        remarks=(*strange(search.whole, calibrated, declared.radius), *differing(search)),
         labels=labels,
         probabilities=search.odds.effects(),
         nothing_lacking=search.odds.nothing,
@@ -203,6 +207,23 @@ def strange(fit: Fit, calibrated: Mapping[str, Value], radius: float) -> list[st
         known = implausible(name, value, radius) if full in calibrated else ""
         texts += [text for text in (known, at_bound(name, value, coefficient)) if text]
     return [f"The fitted {text}. {words}." for text in texts]
+
+
+TOLD = 0.2  # Share of a coefficient's prior deviation from which on its scatter between tracks is told
+
+
+def differing(search: Search) -> list[str]:
+    """A sentence on coefficients and a wind that differ from track to track; none where they hardly do."""
+    listed, values = search.whole.problem.in_own_air.declared_coefficients(), search.whole.unknowns.values
+    told = []
+    for full, size in search.scatter.items():
+        coefficient = listed[full]
+        if size < TOLD * spread(coefficient) or full in OWN_AIR[1:]:
+            continue
+        name = "the air" if full in OWN_AIR else full.partition(".")[2]
+        share = f" ({100.0 * size / abs(values[full]):.2g} %)" if values.get(full) else ""
+        told.append(f"{name} by {sized(size, coefficient.unit)}{share}")
+    return [f"From track to track differ: {', '.join(told)}."] if told else []
 
 
 def in_order(*tests: GenericTest) -> tuple[GenericTest, ...]:

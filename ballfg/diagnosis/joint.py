@@ -15,6 +15,7 @@ import torch
 
 from ballfg.checks import check_range
 from ballfg.diagnosis.diagnosis import in_order, told
+from ballfg.diagnosis.fit.effects import has_effect, with_effects, without_effect
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
@@ -22,7 +23,6 @@ from ballfg.diagnosis.fit.patterns import DRIFT
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.generic_test import LabelCheck
-from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects, without_effect
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
 from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.residual_tests.generic import generic_tests, predicted_test

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.fit.effects import with_effects
 from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.stretches import joined
-from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.search.evaluation import fitted_model
 from ballfg.dynamics import nominal_model, rollout
 from ballfg.dynamics.effects.flight import Wind

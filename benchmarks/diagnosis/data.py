@@ -9,12 +9,12 @@ import torch
 
 from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, PLANTS, STATED_NOISE, Case
 from ballfg.benchmarks.diagnosis.changes import CHANGES
+from ballfg.diagnosis.fit.effects import has_effect, with_effects, without_effect
 from ballfg.diagnosis.fit.fit import first_guess, fit_problem, reachable
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.problem import Problem
 from ballfg.diagnosis.fit.stretches import Stretches, stretches_of
-from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects, without_effect
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import errors_of, predictive_model
 from ballfg.dynamics import AnalyticModel, nominal_model

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from ballfg.checks import did_you_mean, one_line, short_text
 from ballfg.diagnosis.evidence.weighed import weigh
+from ballfg.diagnosis.fit.effects import has_effect
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis, has_effect, hypotheses, scene_of
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis, hypotheses, scene_of
 from ballfg.diagnosis.report.report import REPORT
 from ballfg.diagnosis.result import Diagnosis
 from ballfg.diagnosis.search.trial import score_all

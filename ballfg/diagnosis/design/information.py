@@ -8,9 +8,10 @@ import torch
 
 from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.design.goal import Goal
-from ballfg.diagnosis.fit.problem import Fit, Unknowns
+from ballfg.diagnosis.fit.effects import with_coefficients
+from ballfg.diagnosis.fit.free import Unknowns
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretches
-from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients
 from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times

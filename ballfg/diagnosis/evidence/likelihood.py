@@ -11,35 +11,54 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.diagnosis.evidence.rows import SPIN_KINDS, Rows
+from ballfg.diagnosis.evidence.rows import COEFFICIENTS, SPIN_KINDS, Rows
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, POSITION_LOSS
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.state import STATE_DIM
 
 ROUNDED: Final = 1e-3  # Rounding of inner products from which a stretch is reduced by its rows themselves
+ALMOST_NONE: Final = -4.0  # Logarithm of a size from which on there is some
 LOST: Final = -1e6  # Logarithm of the density of a track under a model that rounding alone decides about
 Weights = tuple[Array, Array, Array]  # Robust weights of samples (n, k) and spins (n,), and their cost (n,)
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Logarithms of the sizes: of white noise and spins (4,) over the stated ones, and of random motion (4,).
+    """Logarithms of the sizes: of white noise and spins (4,) over the stated ones, and of k kinds of random columns.
 
     Spins are those with a label, and the others forward, across and up.
     """
 
     white: float = 0.0
     spin: tuple[float, ...] = (0.0,) * SPIN_KINDS
-    random: tuple[float, ...] = (-4.0,) * 4
+    random: tuple[float, ...] = ()
+
+    @property
+    def scatters(self) -> bool:
+        """Whether coefficients differ from track to track."""
+        return max(self.random[COEFFICIENTS:], default=ALMOST_NONE) > ALMOST_NONE
+
+    @property
+    def calm(self) -> "Noise":
+        """The same without such differences."""
+        return replace(
+            self,
+            random=tuple(min(size, ALMOST_NONE) if k >= COEFFICIENTS else size for k, size in enumerate(self.random)),
+        )
+
+    @classmethod
+    def least(cls, rows: Sequence[Rows]) -> "Noise":
+        """Almost none beside that of the samples."""
+        return cls(random=(ALMOST_NONE,) * max(COEFFICIENTS, 1 + int(rows[0].kinds.max())))
 
     @property
     def vector(self) -> Array:
-        """(9,) all of them."""
+        """(5 + k,) all of them."""
         return np.array([self.white, *self.spin, *self.random])
 
     @classmethod
     def of(cls, vector: Array) -> "Noise":
-        """The noise of (9,) logarithms."""
+        """The noise of (5 + k,) logarithms."""
         spin, random = vector[1 : 1 + SPIN_KINDS], vector[1 + SPIN_KINDS :]
         return cls(float(vector[0]), tuple(spin.tolist()), tuple(random.tolist()))
 

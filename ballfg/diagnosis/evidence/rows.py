@@ -6,7 +6,7 @@ patterns of place, velocity, spin and time would, whose sizes are as free as its
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -14,27 +14,45 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index, Mask
+from ballfg.diagnosis.fit.free import OWN_AIR
 from ballfg.diagnosis.fit.patterns import blocks_of
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.response import ACCELERATION, CONTACT_SPIN, CONTACT_VELOCITY, free_motion
+from ballfg.diagnosis.fit.response import free_motion
+from ballfg.diagnosis.fit.scatter import by_own
 from ballfg.diagnosis.fit.stretches import batches_of, of_similar_length
 from ballfg.state import SPIN, STATE_DIM
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
-"""Kinds of random columns; each kind has one size for all tracks."""
-KINDS: Final = 4
+"""Kinds of random columns, from `COEFFICIENTS` on one for each coefficient; each has one size for all tracks."""
 SPIN_KINDS: Final = 4
 """Kinds of spin rows: of labels, and of other spins about forward, across and up. Each has one size too."""
-SIZES: Final = (ACCELERATION, CONTACT_VELOCITY, CONTACT_SPIN, 1.0)
-"""Unit of each size: m/s^2/sqrt(Hz), m/s, rad/s, and prior standard deviations of the coefficients."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Random columns of n stretches, batch by batch as in `batches_of`."""
+    """Random columns of n stretches, batch by batch as in `batches_of`, and the coefficients that scatter beside them.
+
+    The columns of the latter are those of each fit, at what its stretches have of their own.
+    """
 
     columns: tuple[Array, ...]  # (b, m, r) derivatives at the unit of each kind, zero where a stretch has fewer
     kinds: tuple[Index, ...]  # (b, r) kind of each column, -1 for none
+    spread: Mapping[str, float]  # Unit of each coefficient that scatters
+
+    @property
+    def units(self) -> Array:
+        """(c,) of the coefficients that scatter."""
+        return np.array(list(self.spread.values()))
+
+    @property
+    def own_kinds(self) -> Index:
+        """(c,) kinds of the coefficients that scatter: those of a wind are one, for no axis comes first."""
+        count = sum(name not in OWN_AIR for name in self.spread)
+        return COEFFICIENTS + np.minimum(np.arange(len(self.spread)), count)
+
+    def scatter(self, sizes: Sequence[float]) -> dict[str, float]:
+        """What each coefficient differs by from track to track; sizes: logarithms, by kind."""
+        return dict(zip(self.spread, (np.exp(np.array(sizes)[self.own_kinds]) * self.units).tolist(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -52,8 +70,8 @@ class Rows:
 
     @property
     def counts(self) -> Array:
-        """(1 + SPIN_KINDS + KINDS,) numbers that each size scales: coordinates of samples and spins, random columns."""
-        random = [(self.kinds == kind).sum() for kind in range(KINDS)]
+        """(1 + SPIN_KINDS + k,) numbers that each size scales: coordinates of samples and spins, columns of k kinds."""
+        random = np.bincount(self.kinds[self.kinds >= 0], minlength=COEFFICIENTS)
         spins = np.bincount(self.spin_kinds.ravel(), minlength=SPIN_KINDS)
         return np.array([3 * self.used.sum(), *spins, *random], dtype=np.float64)
 
@@ -107,14 +125,20 @@ def rows_of(fit: Fit, motion: Motion) -> list[Rows]:
     system, stretches, root = fit.linearised, fit.problem.stretches, roots(fit)
     used = stretches.used.numpy()
     residual, by_start, by_common = system.residual / root[..., 0], system.by_start / root, system.by_common / root
+    by_coefficient = by_own(fit, list(motion.spread)) * motion.units / root
+    own = np.zeros((len(used), len(motion.spread)))
+    for place, name in enumerate(motion.spread):
+        own[:, place] = fit.unknowns.own.get(name, 0.0)
+    own /= motion.units
+    residual = residual + (by_coefficient @ own[..., None])[..., 0]
     return [
         Rows(
             batch.numbers,
             batch.of(residual),
             batch.of(by_start),
             batch.of(by_common),
-            random,
-            kinds,
+            np.concatenate((batch.of(by_coefficient), random), axis=-1),
+            np.concatenate((np.broadcast_to(motion.own_kinds, (len(kinds), len(motion.own_kinds))), kinds), axis=1),
             used[batch.numbers, : len(batch.rows) // 3 - 1],
             stretches.labelled[batch.numbers],
         )
@@ -128,13 +152,15 @@ def roots(fit: Fit) -> Array:
     return np.sqrt(np.concatenate((samples, spins), axis=1))[..., None]
 
 
-def random_motion(fit: Fit, scattering: Collection[str] | None = None) -> Motion:
-    """The random columns of a fit.
+def scattering(fit: Fit) -> list[str]:
+    """Coefficients that may differ from track to track: those that are the same for all, and a wind."""
+    same = [n for n in fit.problem.free if n not in fit.problem.deviations and n not in OWN_AIR]
+    return [*same, *OWN_AIR]
 
-    Args: scattering: coefficients that may differ from track to track; None: all that are the same for all tracks.
-    """
-    if scattering is None:
-        scattering = [name for name in fit.problem.free if name not in fit.problem.deviations]
+
+def random_motion(fit: Fit, of: Collection[str] | None = None) -> Motion:
+    """The random columns of a fit.  Args: of: coefficients that may differ from track to track; None: `scattering`."""
+    names = scattering(fit) if of is None else of
     own: dict[int, list[tuple[Array, Array]]] = defaultdict(list)
     for arc in fit.arcs:
         for row, piece in zip(arc.rows.tolist(), free_motion(fit, arc), strict=True):
@@ -142,23 +168,22 @@ def random_motion(fit: Fit, scattering: Collection[str] | None = None) -> Motion
             if piece.contact is not None:
                 kinds[-6:-3], kinds[-3:] = VELOCITIES, SPINS
             own[row].append((piece.columns * piece.sigma, kinds))
-    listed = list(fit.problem.free)
-    chosen = [listed.index(name) for name in scattering]
-    spread, count = np.array([fit.problem.free[name].sigma for name in scattering]), len(chosen)
+    air = fit.problem.in_own_air.declared_coefficients()
+    units = {**fit.problem.free, **{name: air[name] for name in OWN_AIR}}
+    spread = {name: units[name].sigma for name in names}
     root = roots(fit)
-    coefficients = fit.linearised.by_common[..., chosen] * spread / root
     found = []
     for batch in batches_of(fit.problem.stretches.used.numpy()):
-        width = count + max(sum(len(k) for _, k in own[row]) for row in batch.numbers.tolist())
+        width = max(sum(len(k) for _, k in own[row]) for row in batch.numbers.tolist())
         random = np.zeros((len(batch.numbers), len(batch.rows), width))
         kinds = np.full((len(batch.numbers), width), -1)
-        random[..., :count], kinds[:, :count] = batch.of(coefficients), COEFFICIENTS
         for place, row in enumerate(batch.numbers.tolist()):
             columns = np.concatenate([c for c, _ in own[row]], axis=1) / root[row]
-            random[place, :, count : count + columns.shape[1]] = columns[batch.rows]
-            kinds[place, count : count + columns.shape[1]] = np.concatenate([k for _, k in own[row]])
+            random[place, :, : columns.shape[1]] = columns[batch.rows]
+            kinds[place, : columns.shape[1]] = np.concatenate([k for _, k in own[row]])
         found.append((random, kinds))
-    return Motion(*zip(*found, strict=True))
+    columns, kinds = zip(*found, strict=True)
+    return Motion(columns, kinds, spread)
 
 
 NAMELESS: Final = "something nameless"

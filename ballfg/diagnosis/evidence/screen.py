@@ -33,16 +33,20 @@ Gone = tuple[int, ...]  # Places of the model's own effects with strengths that 
 
 @dataclass(frozen=True)
 class Screen:
-    """Inner products of a model's common unknowns and of the strengths of all candidates."""
+    """Inner products of a model's common unknowns and of the strengths of all candidates.
+
+    They are taken at the model's noise, and at the same noise with coefficients that do not scatter from track to
+    track: what all tracks have alike counts as scatter as long as no effect explains it. The better one counts.
+    """
 
     model: Weighed  # Without the candidates
     candidates: Sequence[Hypothesis]
-    tracks: Reduced
-    """Of each track, with the columns of their strengths last, first states and random motion integrated out."""
-    total: Reduced  # Summed over the tracks
+    tracks: tuple[Reduced, ...]
+    """At each noise, of each track, with the columns of strengths last; states and random motion integrated out."""
     priors: Priors  # Of the model's own common unknowns
     _known: "dict[tuple[Beside, int, Gone], _Gain]" = field(default_factory=dict)
-    _condensed: dict[Gone, Condensed] = field(default_factory=dict)
+    _best: dict[tuple[Beside, Gone], tuple[int, float]] = field(default_factory=dict)
+    _condensed: dict[tuple[Gone, int], Condensed] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -61,9 +65,10 @@ class Screen:
         stretches, strengths = model.fit.problem.stretches, columns / roots(model.fit)
         batches = zip(rows_beside(model.fit, motion, patterns), batches_of(stretches.used.numpy()), strict=True)
         wide = [rows.beside(batch.of(strengths)) for rows, batch in batches]
-        tracks = Batches.of(wide, model.weights).reduced(model.noise)[0].by_track(stretches.track)
-        total = tracks.of(np.full(len(model.halves), True))
-        return cls(model, candidates, tracks, total, Priors.of(model.fit, model.named, patterns))
+        likelihood = Batches.of(wide, model.weights)
+        noises = [model.noise, model.noise.calm] if model.noise.scatters else [model.noise]
+        tracks = tuple(likelihood.reduced(noise)[0].by_track(stretches.track) for noise in noises)
+        return cls(model, candidates, tracks, Priors.of(model.fit, model.named, patterns))
 
     @cached_property
     def gains(self) -> list[float]:
@@ -209,10 +214,14 @@ class Screen:
         key = (beside, one, gone)
         if key in self._known:
             return self._known[key]
-        candidate, condensed = self.candidates[one], self._without(gone)
-        least = condensed.whole(*self._further(beside)).evidence
-        found = [condensed.whole(*self._further((*beside, (one, width)))) for width in TRIED]
-        evidence = np.array([after.evidence for after in found])
+        candidate, (_, least) = self.candidates[one], self._noise(beside, gone)
+        each = [
+            [self._without(gone, noise).whole(*self._further((*beside, (one, width)))) for width in TRIED]
+            for noise in range(len(self.tracks))
+        ]
+        evidences = np.array([[after.evidence for after in found] for found in each])
+        noise = int(evidences.max(axis=1).argmax())
+        found, evidence = each[noise], evidences[noise]
         best, size = int(evidence.argmax()), len(candidate.strengths)
         mean, sigmas = found[best].mean[-size:], np.sqrt(np.diagonal(found[best].covariance)[-size:])
         centre = self._centres[one]
@@ -223,14 +232,24 @@ class Screen:
 
     def _held_out(self, beside: Beside, gone: Gone = ()) -> Array:
         """(t,) as of `Weight`."""
-        return self._without(gone).held_out(*self._further(beside))
+        return self._without(gone, self._noise(beside, gone)[0]).held_out(*self._further(beside))
 
-    def _without(self, gone: Gone) -> Condensed:
+    def _noise(self, beside: Beside, gone: Gone) -> tuple[int, float]:
+        """The number of the better noise beside some candidates, and the evidence there, up to a constant."""
+        if (beside, gone) not in self._best:
+            further, noises = self._further(beside), range(len(self.tracks))
+            evidence = [self._without(gone, noise).whole(*further).evidence for noise in noises]
+            best = int(np.argmax(evidence))
+            self._best[beside, gone] = best, evidence[best]
+        return self._best[beside, gone]
+
+    def _without(self, gone: Gone, noise: int) -> Condensed:
         """The candidates' columns, with the model's own unknowns integrated out."""
-        if gone not in self._condensed:
+        if (gone, noise) not in self._condensed:
             precision = self.priors.held(gone, self.model.widths)
-            self._condensed[gone] = Condensed.of(self.tracks, precision, self.priors.away, self.model.halves)
-        return self._condensed[gone]
+            found = Condensed.of(self.tracks[noise], precision, self.priors.away, self.model.halves)
+            self._condensed[gone, noise] = found
+        return self._condensed[gone, noise]
 
     def _further(self, beside: Beside) -> tuple[Index, Array]:
         """Numbers of some candidates' columns among all candidates', and the precision of their priors."""
@@ -253,8 +272,9 @@ class Screen:
     def _posterior(self, beside: Beside, gone: Gone = ()) -> Posterior:
         """Of the model's own unknowns, then of some candidates' strengths."""
         columns, precision = self._further(beside)
-        listed = np.concatenate((np.arange(self._own), self._own + columns, [self.total.gram.shape[-1] - 1]))
-        part = Reduced(self.total.constant, self.total.gram[:, listed[:, None], listed])
+        total = self.tracks[self._noise(beside, gone)[0]].of(np.full(len(self.model.halves), True))
+        listed = np.concatenate((np.arange(self._own), self._own + columns, [total.gram.shape[-1] - 1]))
+        part = Reduced(total.constant, total.gram[:, listed[:, None], listed])
         whole = np.append(self.priors.held(gone, self.model.widths), precision)
         return posterior(part, whole, np.append(self.priors.away, np.zeros(len(columns))))
 

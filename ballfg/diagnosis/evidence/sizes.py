@@ -12,12 +12,14 @@ from scipy import linalg
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.likelihood import Batches, Likelihood, Local, Noise, Posterior, Weights, posterior
-from ballfg.diagnosis.evidence.rows import Rows
+from ballfg.diagnosis.evidence.rows import COEFFICIENTS, SPIN_KINDS, Rows
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import bounded_step
 from ballfg.state import STATE_DIM
 
 LEAST, MOST = -5.0, 5.0  # Bounds of the logarithm of a size over its unit
+MOST_SCATTER: Final = 1.1
+"""Largest logarithm of the scatter of a coefficient over the prior deviation of an unknown one: a factor of 3."""
 MOST_STEPS, SETTLED = 30, 0.05  # Largest number of steps of the sizes, and the gain of evidence that ends them
 ENOUGH: Final = 0.05
 """Share of what a step of the common unknowns should gain that ends the sizes' steps too: it will change them."""
@@ -70,7 +72,7 @@ def begun(rows: Sequence[Rows], start: Start | None) -> Sized:
     Labels begin with a weight of one: their loss is not convex, and one that a wrong model contradicts would stay out.
     """
     if start is None:
-        return Batches.of(rows), Noise()
+        return Batches.of(rows), Noise.least(rows)
     known = start.weights and [(samples, np.ones_like(spins), cost) for samples, spins, cost in start.weights]
     return Batches.of(rows, known).reweighted(start.noise), start.noise
 
@@ -109,16 +111,19 @@ def _climbed(
             likelihood, noise, found, to_come, local = weights, moved, after, ahead, eliminated
         if gain < max(SETTLED, ENOUGH * to_come):
             break
-    return found.evidence, likelihood, noise
+    likelihood = likelihood.reweighted(noise)
+    return at(likelihood, noise)[0].evidence, likelihood, noise
 
 
 def _bounded_step(sizes: Array, slopes: Slopes) -> Array:
-    """(9,) step of the logarithms of the sizes (9,), within their bounds; each is damped by its slope."""
+    """(s,) step of the logarithms of the sizes (s,), within their bounds; each is damped by its slope."""
+    most = np.full(len(sizes), MOST)
+    most[1 + SPIN_KINDS + COEFFICIENTS :] = MOST_SCATTER
     slope, curved = slopes.slope, slopes.information + np.diag(np.abs(slopes.slope)) / LONGEST
-    free = np.flatnonzero(~((sizes <= LEAST) & (slope <= 0.0) | (sizes >= MOST) & (slope >= 0.0)))
+    free = np.flatnonzero(~((sizes <= LEAST) & (slope <= 0.0) | (sizes >= most) & (slope >= 0.0)))
     step = np.zeros(len(sizes))
     step[free] = np.linalg.lstsq(curved[np.ix_(free, free)], slope[free])[0]
-    return np.clip(sizes + step, LEAST, MOST) - sizes
+    return np.clip(sizes + step, LEAST, most) - sizes
 
 
 def slopes_at(

@@ -8,9 +8,10 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
-from ballfg.diagnosis.evidence.likelihood import Noise, Reduced, Weights, held_out, posterior
+from ballfg.diagnosis.evidence.likelihood import Batches, Noise, Reduced, Weights, held_out, posterior
+from ballfg.diagnosis.evidence.own import carried_over, most_probable
 from ballfg.diagnosis.evidence.prior import WIDTHS, Priors, choice_odds, log_odds, within
-from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, Rows, random_motion, rows_beside
+from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, Rows, random_motion, rows_beside, scattering
 from ballfg.diagnosis.evidence.sizes import (
     DAMPED,
     FIRST_DAMPING,
@@ -23,9 +24,12 @@ from ballfg.diagnosis.evidence.sizes import (
     next_damping,
 )
 from ballfg.diagnosis.fit.fit import followed, with_guesses
+from ballfg.diagnosis.fit.free import OWN_AIR
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
+MOST_TURNS = 4  # Largest number of times that paths follow what the coefficients of each stretch differ by
+HARDLY_MOVED = 0.1  # Largest change of such a difference, over its unit, that paths need not follow
 MOST_STEPS = 12  # Largest number of steps from a deterministic fit to the most probable unknowns
 WORTH_A_STEP = 0.5  # Least expected gain of a step, natural units
 
@@ -76,6 +80,9 @@ class Weighed(Weight):
     """The weight of each smaller model, by its names, the rest linearised where it is."""
     neighbours: Mapping[frozenset[str], Weight] = field(default_factory=dict)
     """The same of models with a further effect, or with another one in place of one of its own."""
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations of the fit's coefficients, beside what differs from track to track."""
+    scatter: Mapping[str, float] = field(default_factory=dict)  # What coefficients differ by from track to track
 
     @property
     def names(self) -> frozenset[str]:
@@ -109,7 +116,9 @@ def weigh(fit: Fit, named: Sequence[Hypothesis] = (), *, nameless: bool = False)
     Returns: the model with its evidence; ratios of evidences compare models of the same stretches.
     """
     patterns = Patterns.of(fit) if nameless else None
-    return weighed(fit, named, random_motion(fit), unlike_halves(fit), patterns=patterns)
+    own = {name for h in named for name in h.free()}
+    motion = random_motion(fit, [name for name in scattering(fit) if name not in own or name in OWN_AIR])
+    return weighed(fit, named, motion, unlike_halves(fit), patterns=patterns)
 
 
 def weighed(
@@ -131,12 +140,15 @@ def weighed(
         order of the fit's tracks (`unlike_halves`).  like: a similar model.  patterns: of this or a similar model.
     """
     with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
-        question, closest = _Question(named, motion, halves, patterns), followed(fit, fit.unknowns)
-        starts = (like.start, None) if like else (None,)
-        point = question.point(closest if np.isfinite(closest.cost) else fit, starts)
-        found, ahead, density = question.at(point)
+        question = _Question(named, motion, halves, patterns)
+        point, (found, ahead, density) = question.begun(fit, like)
         if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
             return question.at(point.begun_at((found.start,)), found.widths)[0]
+        for _ in range(MOST_TURNS):
+            turned = question.turned(point, found)
+            if turned is None:
+                break
+            point, (found, ahead, density) = turned
         for _ in range(MOST_STEPS):
             moved = question.moved(point, found, ahead, density)
             if moved is None:
@@ -168,6 +180,9 @@ class _Point:
         return len(self.fit.problem.common_precision)
 
 
+_At = tuple[Weighed, Ahead, float]
+
+
 @dataclass(frozen=True)
 class _Question:
     """The arguments of `weighed` that stay the same at all values of the unknowns."""
@@ -187,7 +202,7 @@ class _Question:
         rows = rows_beside(fit, self.motion, self.patterns)
         return _Point(fit, rows, Priors.of(fit, self.named, self.patterns)).begun_at(starts)
 
-    def at(self, point: _Point, widths: Sequence[int] = (), damping: float = 0.0) -> tuple[Weighed, Ahead, float]:
+    def at(self, point: _Point, widths: Sequence[int] = (), damping: float = 0.0) -> _At:
         """The model at the unknowns of a point, the way to more probable ones, and the density as in `_density`.
 
         Args: widths: of the effects, then of the patterns, of a similar model.  damping: of the next step.
@@ -223,6 +238,8 @@ class _Question:
             self.halves,
             self.nameless,
             self._nested(priors, total, best, mixed),
+            sigmas=dict(zip(fit.problem.free, np.sqrt(np.diagonal(result.covariance)).tolist(), strict=False)),
+            scatter=self.motion.scatter(noise.random),
         )
         return weighed, replace(Ahead.of(fit, result), damping=damping), result.held(own).evidence
 
@@ -239,13 +256,53 @@ class _Question:
             step, promised = ahead.step(damping)
             if promised < WORTH_A_STEP:
                 return None
-            fit = followed(point.fit, point.fit.stepped(step))
+            fit = followed(point.fit, replace(point.fit.stepped(step), own=self._own(point, model, step)))
             after = self.point(fit, (model.start,)) if np.isfinite(fit.cost) else None
             density = -np.inf if after is None else self._density(after, model.widths)
             share = (density - before) / promised
             if after is not None and share > HARDLY:
                 return after, next_damping(damping, share)
             damping = max(FIRST_DAMPING, DAMPED * damping)
+
+    def begun(self, fit: Fit, like: Weighed | None) -> tuple[_Point, _At]:
+        """The more probable of two beginnings: tracks that are all alike, and what they have of their own by another.
+
+        Args: like: the other, similar model.
+        """
+        own = {} if like is None else carried_over(like.fit, like.named, fit, self.named)
+        starts = [None] if like is None else [like.start] if own else [like.start, None]
+        points = [self.point(self._about(fit, own), starts)]
+        if own:
+            points.append(self.point(self._about(fit, {}), [None]))
+        found = [(point, self.at(point)) for point in points]
+        return max(found, key=lambda one: one[1][0].evidence)
+
+    def turned(self, point: _Point, model: Weighed) -> tuple[_Point, _At] | None:
+        """A more probable model, about the paths with what coefficients of each stretch most probably differ by.
+
+        Half of the way leads to one where the whole leaves the linear range; None if neither does.
+        """
+        before = point.fit.unknowns.own
+        moves = {n: value - before.get(n, 0.0) for n, value in self._own(point, model, np.zeros(point.own)).items()}
+        away = [np.abs(moves[name]).max() / unit for name, unit in self.motion.spread.items()]
+        if max(away, default=0.0) < HARDLY_MOVED:
+            return None
+        for share in (1.0, 0.5):
+            fit = self._about(point.fit, {name: before.get(name, 0.0) + share * move for name, move in moves.items()})
+            after = self.point(fit, [model.start])
+            found = self.at(after)
+            if found[0].evidence > model.evidence:
+                return after, found
+        return None
+
+    def _own(self, point: _Point, model: Weighed, step: Array) -> dict[str, Array]:
+        return most_probable(point.fit, Batches.of(point.rows, model.weights), model.noise, self.motion, step)
+
+    @staticmethod
+    def _about(fit: Fit, own: Mapping[str, Array]) -> Fit:
+        """The fit with what stretches have of their own; the fit itself if paths then miss their contacts."""
+        closest = followed(fit, replace(fit.unknowns, own=own))
+        return closest if np.isfinite(closest.cost) else fit
 
     def _density(self, point: _Point, widths: Sequence[int]) -> float:
         """Logarithm of the density at the unknowns of a point, up to a constant, where its noise begins.

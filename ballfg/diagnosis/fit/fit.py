@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array, Mask
-from ballfg.diagnosis.fit.free import declared_deviations, declared_free
-from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, scatter_axes
+from ballfg.diagnosis.fit.free import Unknowns, declared_deviations, declared_free
+from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, scatter_axes
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
@@ -107,7 +107,13 @@ def followed(fit: Fit, unknowns: Unknowns) -> Fit:
     names, system = fit.problem.free, fit.linearised
     values = np.array([unknowns.values[name] - fit.unknowns.values[name] for name in names])
     step = np.concatenate((values, (unknowns.launcher - fit.unknowns.launcher).ravel()))
-    starts = fit.unknowns.starts + system.eliminated().start_step(step)
+    expected = system.residual - system.by_common @ step
+    none = np.zeros(len(fit.unknowns.starts))
+    for place, name in enumerate(names):
+        if name in unknowns.own or name in fit.unknowns.own:
+            moved_own = unknowns.own.get(name, none) - fit.unknowns.own.get(name, none)
+            expected = expected - system.by_common[..., place] * moved_own[:, None]
+    starts = fit.unknowns.starts + system.start_correction(expected)
     moved = Fit.at(fit.problem, replace(unknowns, starts=starts), fit.noise)
     for _ in range(CORRECTIONS):
         moved = _followed_up(moved, system, fit.robust)
@@ -131,6 +137,15 @@ def covariance_of(fit: Fit, names: Sequence[str]) -> Array:
     listed = list(fit.problem.free)
     chosen = [listed.index(name) for name in names]
     return np.asarray(np.linalg.inv(total)[np.ix_(chosen, chosen)])
+
+
+def alike(fit: Fit) -> Fit:
+    """The fit with the same coefficients for all tracks, with paths that come closest to the samples."""
+    if not fit.unknowns.own:
+        return fit
+    near = followed(fit, replace(fit.unknowns, own={}))
+    found = fit_problem(replace(near.problem, shared=False), near.unknowns, near.noise, settle_noise=False)
+    return replace(found, problem=replace(found.problem, shared=fit.problem.shared))
 
 
 def _minimise(now: Fit, steps: int = MOST_STEPS) -> Fit:

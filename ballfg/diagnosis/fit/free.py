@@ -1,19 +1,36 @@
-"""Chooses the unknowns of a fit beside first states: the model's coefficients and their deviations on tracks."""
+"""The unknowns of a fit: the model's coefficients, their deviations on tracks, and what tracks have of their own."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.dynamics import AnalyticModel, Coefficient
+from ballfg.dynamics.effects.flight import Wind
 from ballfg.tracks import Track
 
 LOOSE = 10.0
 """Factor by which a hypothesis' coefficient has a wider prior than its effect declares: the data should decide."""
 INEXACT = 0.02
 """Spread of a coefficient that is declared as exact, as a share of its value: a wrong clock or length changes g so."""
+OWN_AIR = tuple(f"{Wind.kind}.{Wind.name}.{c.name}" for c in Wind.coefficients)
+"""Coefficients of a wind that every track may have of its own."""
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """All unknowns of a fit: first states (n, 9), coefficients by parameter name, and the launcher.
+
+    The launcher is (s, 3) rad/s per unit of each setting: spin about forward, across and up.
+    """
+
+    starts: Array
+    values: dict[str, float]
+    launcher: Array
+    own: Mapping[str, Array] = field(default_factory=dict)
+    """By parameter name, (n,) what the coefficients of each stretch differ by from those of all."""
 
 
 @dataclass(frozen=True)
@@ -62,3 +79,11 @@ def declared_deviations(
             deviations[unknown] = Deviation(name, weights, variation.by, level, line=variation.line)
             values[unknown] = value - base
     return free, deviations, values
+
+
+def coefficients_of_all(
+    model: AnalyticModel, names: Iterable[str], found: Mapping[str, float | Array]
+) -> dict[str, float | Array]:
+    """What the coefficients of stretches differ from, of those that the model has."""
+    parameters = dict(model.named_parameters())
+    return {name: found.get(name, float(parameters[name])) for name in names if name in parameters}

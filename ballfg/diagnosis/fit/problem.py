@@ -1,19 +1,21 @@
 """Defines a fit problem with its unknowns, priors and losses, and linearises its rows."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Self
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.fit.free import Deviation
+from ballfg.diagnosis.fit.effects import has_effect, with_effects
+from ballfg.diagnosis.fit.free import OWN_AIR, Deviation, Unknowns, coefficients_of_all
 from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, fitted_path, responses
 from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System, by_track
 from ballfg.dynamics import AnalyticModel, Coefficient
+from ballfg.dynamics.effects.flight import Wind
 from ballfg.dynamics.population import SOFT_SPEED, launch_axes as group_axes
 from ballfg.dynamics.variation import Variation
 from ballfg.factors.loss import Loss
@@ -22,18 +24,6 @@ from ballfg.state import SPIN, STATE_DIM, VELOCITY
 POSITION_LOSS = Loss("huber", 3.0)  # Loss of a whitened position residual (three coordinates)
 LABEL_LOSS = Loss("cauchy", 3.0)  # Loss of a whitened spin label: some labels contradict the flight
 LAUNCHER_SPIN_SIGMA = 150.0  # rad/s, prior per axis, about zero, of the spin for a launcher setting of typical size
-
-
-@dataclass(frozen=True)
-class Unknowns:
-    """All unknowns of a fit: first states (n, 9), coefficients by parameter name, and the launcher.
-
-    The launcher is (s, 3) rad/s per unit of each setting: spin about forward, across and up.
-    """
-
-    starts: Array
-    values: dict[str, float]
-    launcher: Array
 
 
 @dataclass(frozen=True)
@@ -88,6 +78,11 @@ class Problem:
         """(q + 3 s,) of the priors of all common columns: coefficients, then launcher settings."""
         return np.concatenate((self.precisions, np.repeat(self.launcher_precision, 3)))
 
+    @cached_property
+    def in_own_air(self) -> AnalyticModel:
+        """The model with a wind, which every track may have of its own."""
+        return self.model if has_effect(self.model, Wind.name) else with_effects(self.model, Wind())
+
     def by_stretch(self, values: Mapping[str, float], stretches: Stretches | None = None) -> dict[str, float | Array]:
         """Coefficients by parameter name: one number, or (n,) if deviations make them differ between n stretches.
 
@@ -126,14 +121,18 @@ class Fit:
     @classmethod
     def at(cls, problem: Problem, unknowns: Unknowns, noise: Noise) -> Self:
         """The prediction at some unknowns."""
-        values = problem.by_stretch(unknowns.values)
-        predicted = predict(problem.model, problem.stretches, unknowns.starts, values)
-        return cls(problem, unknowns, noise, predicted)
+        model, values = _of_each(problem, unknowns)
+        return cls(problem, unknowns, noise, predict(model, problem.stretches, unknowns.starts, values))
 
     @property
     def values(self) -> dict[str, float | Array]:
-        """Fitted coefficients, as `Problem.by_stretch`."""
-        return self.problem.by_stretch(self.unknowns.values)
+        """Fitted coefficients, as `Problem.by_stretch`, with what each stretch has of its own."""
+        return _of_each(self.problem, self.unknowns)[1]
+
+    @property
+    def model(self) -> AnalyticModel:
+        """The model of the motion, with a wind if stretches have their own."""
+        return _of_each(self.problem, self.unknowns)[0]
 
     @property
     def limits(self) -> tuple[Array, Array]:
@@ -150,7 +149,14 @@ class Fit:
             name: float(np.clip(unknowns.values[name] + change, c.low, c.high))
             for (name, c), change in zip(free.items(), step[: len(free)].tolist(), strict=True)
         }
-        return Unknowns(unknowns.starts, values, unknowns.launcher + step[len(free) :].reshape(-1, 3))
+        return replace(unknowns, values=values, launcher=unknowns.launcher + step[len(free) :].reshape(-1, 3))
+
+    def within(self, own: Mapping[str, Array]) -> dict[str, Array]:
+        """What coefficients of stretches differ by, as far as their bounds allow."""
+        model = self.problem.in_own_air
+        declared, values = model.declared_coefficients(), self.problem.by_stretch(self.unknowns.values)
+        means = coefficients_of_all(model, own, values)
+        return {n: np.clip(mean + own[n], declared[n].low, declared[n].high) - mean for n, mean in means.items()}
 
     def variations(self) -> dict[str, Variation]:
         """Coefficients that differ between tracks, as fitted, by parameter name."""
@@ -223,14 +229,14 @@ class Fit:
         """
         problem, deviations = self.problem, self.problem.deviations
         if not problem.shared:  # first states only: columns of coefficients stay zero
-            found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, self.values, ())
+            found = sensitivity(self.model, problem.stretches, self.unknowns.starts, self.values, ())
             none = [(0, 0)] * (found.labels.ndim - 1) + [(0, len(problem.free))]
             return Sensitivity(np.pad(found.positions, [(0, 0), *none]), np.pad(found.labels, none))
         behind = [deviations[name].coefficient if name in deviations else name for name in problem.free]
         names = list(dict.fromkeys(behind))
         parameters = dict(problem.model.named_parameters())
         known = {name: float(parameters[name].detach()) for name in names} | self.values
-        found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, known, names)
+        found = sensitivity(self.model, problem.stretches, self.unknowns.starts, known, names)
         if not deviations:
             return found
         chosen = [*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in behind)]
@@ -280,6 +286,16 @@ class Fit:
         by_common = np.concatenate((rows[..., STATE_DIM:], by_launcher), axis=-1)
         used = stretches.used.numpy()
         return System(self.weighted_residual(self.robust), rows[..., :STATE_DIM], by_common, used)
+
+
+def _of_each(problem: Problem, unknowns: Unknowns) -> tuple[AnalyticModel, dict[str, float | Array]]:
+    """The model, and its coefficients by parameter name, one number or (n,)."""
+    found, own = problem.by_stretch(unknowns.values), unknowns.own
+    if not own:
+        return problem.model, found
+    model = problem.in_own_air if any(name in own for name in OWN_AIR) else problem.model
+    means = coefficients_of_all(model, own, found)
+    return model, found | {name: means[name] + own[name] for name in means}
 
 
 def scatter_axes(starts: Array) -> Array:

@@ -74,7 +74,7 @@ def fitted_path(fit: "Fit") -> FittedPath:
     """The motion at a fit's minimum."""
     stretches = fit.problem.stretches
     with torch.no_grad():
-        model = with_values(fit.problem.model, fit.values, len(stretches))
+        model = with_values(fit.model, fit.values, len(stretches))
         times = model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
         starts = torch.from_numpy(fit.unknowns.starts)
         motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1])
@@ -131,7 +131,7 @@ def _at(arc: Arc, rows: Tensor, times: Tensor) -> Array:
 
 def _shot(fit: "Fit", number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
     """States (m, q, 9) at nodes, and derivatives by an arc's first state: theirs, and (m, k, 3, 9) of positions."""
-    model, stretches, path, arc = fit.problem.model, fit.problem.stretches, fit.path, fit.path.motion.arcs[number]
+    model, stretches, path, arc = fit.model, fit.problem.stretches, fit.path, fit.path.motion.arcs[number]
     rows, begun, start = arc.rows[part], arc.begun[part], arc.nodes[0][part]
     values = {name: value if isinstance(value, float) else value[rows.numpy()] for name, value in fit.values.items()}
     times, heights = path.times[:, rows] - begun, stretches.heights[rows, number:]

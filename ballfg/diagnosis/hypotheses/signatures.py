@@ -114,7 +114,7 @@ def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:
     One model holds all of them at zero strength, so that none affects another. A deviation needs no derivative of its
     own: it is that of its coefficient, times a weight.
     """
-    model = fit.problem.model
+    model = fit.model
     for hypothesis in group:
         model = hypothesis.added_to(model)
     asked = [_asked(h) for h in group]

@@ -14,10 +14,11 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Index
+from ballfg.diagnosis.fit.effects import has_effect, with_effects
 from ballfg.diagnosis.fit.fit import covariance_of
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.result import Value
 from ballfg.dynamics import AnalyticModel, Coefficient, Scene
 from ballfg.dynamics.effect import Effect

@@ -7,9 +7,10 @@ from typing import Final
 import numpy as np
 
 from ballfg.checks import check_range
+from ballfg.diagnosis.fit.effects import has_effect, with_coefficients, with_effects
 from ballfg.diagnosis.fit.holdout import analytic
 from ballfg.diagnosis.generic_test import ALARM, GenericTest
-from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis, has_effect, with_coefficients, with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import TWINS, Hypothesis
 from ballfg.diagnosis.one_view.picture import ERRORS, Picture
 from ballfg.diagnosis.one_view.search import Found, search
 from ballfg.diagnosis.one_view.strokes import share_of

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients
+from ballfg.diagnosis.fit.effects import with_coefficients
 from ballfg.diagnosis.one_view.picture import NAMES, Picture, known_bounces, slopes
 from ballfg.dynamics import AnalyticModel, Surfaces
 from ballfg.dynamics.motion.rollout import rollout

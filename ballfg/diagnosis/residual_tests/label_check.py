@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.fit.effects import with_effects
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.generic_test import GenericTest, LabelCheck, LabelVerdict
-from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.search.evaluation import noise_about
 from ballfg.dynamics import AnalyticModel, Surfaces
 from ballfg.estimation import Settings, Smoother, Status, TrackProblem, dataset_settings

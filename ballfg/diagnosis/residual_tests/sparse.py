@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.fit.effects import has_effect
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures
 from ballfg.diagnosis.result import Errors, Fallback
 from ballfg.diagnosis.search.evaluation import next_shot_model, noise_about

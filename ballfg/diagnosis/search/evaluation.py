@@ -16,11 +16,11 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.evidence.likelihood import posterior
 from ballfg.diagnosis.evidence.rows import random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import settled
+from ballfg.diagnosis.fit.effects import with_coefficients, with_effects
 from ballfg.diagnosis.fit.fit import fit_problem, reachable
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches, joined
-from ballfg.diagnosis.hypotheses.hypothesis import with_coefficients, with_effects
 from ballfg.diagnosis.result import Errors, PredictedPath
 from ballfg.dynamics import AnalyticModel, BallModel, Surfaces
 from ballfg.dynamics.coefficient import coefficient_sigmas

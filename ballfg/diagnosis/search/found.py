@@ -180,7 +180,10 @@ class Found(WeighedModels):
             screen = screen_of(model, self.motion, loop.catalogue, varying, self.patterns)
             self.add(Sets.near(screen, MOST_EFFECTS))
         scores = self.scores
-        names = max((*self.models, *(n for sets in self.sets for n in sets.members)), key=lambda names: scores[names])
+        able = [*self.models, *(n for sets in self.sets for n in sets.members)]
+        names = max(
+            (n for n in able if n in scores), key=lambda names: scores[names]
+        )  # sets about older paths may lack
         self.best = self.model(names)
 
     @cached_property

@@ -1,10 +1,10 @@
 """The search adds, removes and exchanges effects as long as that makes the model more probable."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from ballfg.diagnosis.evidence.odds import Odds
-from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.fit import alike, fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.varying import Grouping
@@ -33,6 +33,9 @@ class Search:
     findings: tuple[Finding, ...] = ()
     rounds: tuple[tuple[Candidate, ...], ...] = ()
     odds: Odds = field(default_factory=Odds)  # Probability of each effect that was weighed
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations of the coefficients of `whole`, beside what differs from track to track."""
+    scatter: Mapping[str, float] = field(default_factory=dict)  # What coefficients differ by from track to track
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,8 @@ class SearchLoop:
         """The search with the named effects only, its predictions and findings."""
         stamps, odds = self.holdout.stamps, found.odds
         final = found.named_at(self.name_at)
-        whole = found.plain(final).fit
+        plain = found.plain(final)
+        whole = alike(plain.fit)
         if final.nameless and final.named:
             whole = with_strengths_of(final, whole)
         self.watch("predicting the other half")
@@ -104,4 +108,6 @@ class SearchLoop:
             (*stamp_findings(first, stamps, whole), *findings),
             tuple(ranking(r.scored, r.refits, r.added, odds) for r in found.rounds),
             odds,
+            plain.sigmas,
+            plain.scatter,
         )

@@ -14,9 +14,10 @@ from ballfg.diagnosis.evidence.prior import centres
 from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, random_motion
 from ballfg.diagnosis.evidence.sets import Sets
 from ballfg.diagnosis.evidence.weighed import WORTH_A_STEP, Weighed, weighed
-from ballfg.diagnosis.fit.fit import fit_problem, followed
+from ballfg.diagnosis.fit.effects import has_effect, with_coefficients, without_effect
+from ballfg.diagnosis.fit.fit import alike, fit_problem, followed
 from ballfg.diagnosis.fit.problem import Fit, Problem
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, with_coefficients, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.search.refits import FIRST_STEPS, refit_set
 from ballfg.diagnosis.search.score import Scored
 from ballfg.estimation.batch import do_all
@@ -253,6 +254,7 @@ def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
     They begin at the first one's values where a ball leaves its path without an effect: a large lift that saturates
     without its saturation, say.
     """
+    fit = alike(fit)
     problem = _problem_without(fit.problem, gone, first)
     known, plain = fit.unknowns, first.unknowns
     kept = replace(known, values={n: known.values[n] for n in problem.free})

@@ -8,9 +8,10 @@ import torch
 from scipy import stats
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.fit import fit_problem, followed
+from ballfg.diagnosis.fit.effects import with_effects
+from ballfg.diagnosis.fit.fit import alike, fit_problem, followed
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit, Problem
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import ALARM, Score, Scored
 from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.state import SPIN
@@ -101,6 +102,7 @@ def refit(before: Fit, scored: Scored) -> Refit:
 
     Args: before: the fit without the hypothesis.  scored: the hypothesis and its score test.
     """
+    before = alike(before)
     shaped = [replace(scored, hypothesis=shape) for shape in (scored.hypothesis, *scored.shapes)]
     return min((_refit(before, shape) for shape in shaped), key=lambda r: r.fit.cost)
 
@@ -155,6 +157,7 @@ def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
     launcher settings and single shots get their spins. They do so first, with a fixed coefficient: bounces alone may
     have given spins the wrong sign, which a free coefficient would adopt.
     """
+    before = alike(before)
     listed = {hypothesis.parameter(n): c for n, c in hypothesis.coefficients.items()}
     free = {**before.problem.free, **{name: listed[name] for name in hypothesis.columns}}
     model = with_effects(before.problem.model, hypothesis.effect())
@@ -174,6 +177,7 @@ def refit_usual(before: Fit, hypothesis: Hypothesis) -> Refit:
     The usual strength is far from absence, where the slope may carry no information. Without friction, for instance, a
     ball keeps its spin through a bounce, and nothing shows how friction would change the fitted spin.
     """
+    before = alike(before)
     after = refit(before, Scored(hypothesis, None, 1.0)).fit
     return _by_likelihood(before, after, hypothesis, 0.0, len(hypothesis.columns))
 
@@ -223,7 +227,7 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
     labelled = problem.stretches.take(problem.stretches.labelled)
     bare = replace(labelled, labels=torch.full_like(labelled.labels, torch.nan), settings=0.0 * labelled.settings)
     starts = before.unknowns.starts[problem.stretches.labelled]
-    unknowns = replace(before.unknowns, starts=starts, values=problem.declared)
+    unknowns = replace(before.unknowns, starts=starts, values=problem.declared, own={})
     alone = replace(problem, stretches=bare, shared=False)
     result = fit_problem(alone, unknowns, replace(before.noise, spin=np.full(3, UNLABELLED_SPIN)), settle_noise=False)
     covariances = np.linalg.inv(result.linearised.start_information)[:, SPIN, SPIN]

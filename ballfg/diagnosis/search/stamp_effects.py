@@ -9,12 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ballfg.diagnosis.fit.effects import with_effects, without_effect
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.fit.stamps import Stamps
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.result import Finding
 from ballfg.diagnosis.search.ranking import fitted_values
 from ballfg.dynamics import AnalyticModel

@@ -11,8 +11,10 @@ import numpy as np
 from ballfg.diagnosis.evidence.rows import Motion, Patterns, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
+from ballfg.diagnosis.fit.effects import has_effect
+from ballfg.diagnosis.fit.fit import alike
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, hypotheses, scene_of
 from ballfg.diagnosis.hypotheses.signatures import columns_of, hypothesis_signatures
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying, near, varying_hypotheses
 from ballfg.diagnosis.search.refits import Attempt, Refit, frame_hypotheses, refit, refit_driven, refit_set, refit_usual
@@ -47,7 +49,8 @@ def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> 
     """
     columns = columns_of(model.fit, testable)
     screen = Screen.of(model, motion, testable, columns)
-    scores = score_tests(*hypothesis_signatures(model.fit, testable, columns))
+    fit = alike(model.fit)  # a score takes what tracks have alike from all that an effect could explain
+    scores = score_tests(*hypothesis_signatures(fit, testable, columns if fit is model.fit else None))
     scored = []
     for hypothesis, score, gain in zip(testable, scores, screen.gains, strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))

@@ -46,7 +46,7 @@ def test_first_states_that_follow_are_those_of_a_fit_of_them_alone(make_ball, mo
 def test_a_step_gains_what_it_promises(make_ball, moved_shots, make_fit):
     """From a drag that is far off: what the linear model foretells of the density of all tracks comes true."""
     fit = make_fit(make_ball(), moved_shots)
-    question = weighing._Question((), random_motion(fit), unlike_halves(fit), None)
+    question = weighing._Question((), random_motion(fit, ()), unlike_halves(fit), None)
     point = question.point(followed(fit, at_drag(fit, 0.02)), (None,))
     found, ahead, density = question.at(point)
     after, damping = question.moved(point, found, ahead, density)

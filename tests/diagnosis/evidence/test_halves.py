@@ -64,7 +64,10 @@ def test_no_half_is_too_small_to_teach(odd):
 
 
 def test_a_wrong_effect_is_not_borne_out_by_unlike_shots(make_ball, make_launches, make_shots, make_fit):
-    """Drag that grows with the spin, of shots with and without: a lens distorts both alike."""
+    """Drag that grows with the spin, of shots with and without: a lens distorts both alike.
+
+    What is left of it has to beat something nameless (`test_a_wrong_effect_alone_gets_no_name`).
+    """
     launches = make_launches(24, 9, spread=0.1, spin=10.0)
     launches[::4, 7] += 150.0
     launches[1::4, 7] += 150.0
@@ -83,5 +86,5 @@ def test_a_wrong_effect_is_not_borne_out_by_unlike_shots(make_ball, make_launche
         return (tempered(model.names, model, own) - nothing.evidence) / promised
 
     assert borne_out("distortion", alternating) == 1.0
-    assert borne_out("distortion", unlike_halves(declared)) < 0.5
+    assert borne_out("distortion", unlike_halves(declared)) < borne_out("distortion", alternating)
     assert borne_out("drag_spin", unlike_halves(declared)) == 1.0

@@ -22,7 +22,7 @@ from ballfg.diagnosis.evidence.rows import batches_of, random_motion, rows_of
 from ballfg.diagnosis.evidence.sizes import Start, settled, slopes_at
 from ballfg.state import STATE_DIM
 
-NOISE = Noise(0.1, (0.2, -0.3, 0.4, 0.1), (-0.7, -1.1, -0.4, -1.2))
+NOISE = Noise(0.1, (0.2, -0.3, 0.4, 0.1), (-0.7, -1.1, -0.4, -1.2, -0.6))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def dense_rows(likelihood, noise, precision, away):
         shown = np.linalg.svd(whole if rows.labelled[i] else whole[:-3, :6], compute_uv=False)
         logs += 0.5 * np.log(weights).sum() + likelihood.penalty[i] - np.log(shown).sum()
     common = np.concatenate([p[2] for p in parts])
-    added = [linalg.block_diag(*(p[3][size] for p in parts)) for size in range(9)] + [common / precision @ common.T]
+    added = [linalg.block_diag(*(p[3][size] for p in parts)) for size in range(10)] + [common / precision @ common.T]
     left = np.concatenate([p[0] for p in parts]) - common @ away
     return left, linalg.block_diag(*(p[1] for p in parts)), added, logs
 
@@ -154,8 +154,8 @@ def test_derivative_is_that_of_differences(likelihood, prior):
 
     slope = slopes_of(likelihood, prior).slope
     step = 1e-5
-    moved = [NOISE.vector + step * sign * axis for axis in np.eye(9) for sign in (1, -1)]
-    differences = np.array([value(v) for v in moved]).reshape(9, 2) @ [1, -1] / (2 * step)
+    moved = [NOISE.vector + step * sign * axis for axis in np.eye(10) for sign in (1, -1)]
+    differences = np.array([value(v) for v in moved]).reshape(10, 2) @ [1, -1] / (2 * step)
     np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
@@ -165,7 +165,7 @@ def test_information_is_the_average_of_the_observed_and_the_expected(likelihood,
     left, starts, added, _ = dense_rows(likelihood, NOISE, *prior)
     inverse = np.linalg.inv(sum(added))
     without = inverse - inverse @ starts @ np.linalg.solve(starts.T @ inverse @ starts, starts.T @ inverse)
-    shown = np.stack([2.0 * one @ without @ left for one in added[:9]])
+    shown = np.stack([2.0 * one @ without @ left for one in added[:10]])
     np.testing.assert_allclose(found, 0.5 * shown @ without @ shown.T, rtol=1e-6, atol=1e-8 * np.abs(found).max())
 
 
@@ -216,7 +216,7 @@ def test_sizes_of_noise_come_back(make_ball, make_launches, make_shots, make_fit
 
 def test_the_best_of_several_starts_counts(rows, prior):
     """A start with noise that the samples do not have may end elsewhere; beside the usual one it does no harm."""
-    starts = (Start(Noise(-1.0, (1.0,) * 4, (2.0, 2.0, 2.0, 1.0))), None)
+    starts = (Start(Noise(-1.0, (1.0,) * 4, (2.0, 2.0, 2.0, 1.0, 1.0))), None)
     values = [
         posterior(one.reduced(noise)[0], *prior).evidence
         for one, noise in (settled([rows], *prior, s) for s in ((starts[0],), (None,), starts))

@@ -86,7 +86,7 @@ def test_the_right_effect_in_place_of_a_wrong_one_is_foretold(make_ball, make_la
     )
     windy = weigh(refit(fit, Scored(wind, None, 0.0)).fit, [wind])
     wrong = weigh(refit(fit, Scored(tilt, None, 0.0)).fit, [tilt])
-    found = Screen.of(wrong, random_motion(wrong.fit), [wind], columns_of(wrong.fit, [wind]))
+    found = Screen.of(wrong, random_motion(fit), [wind], columns_of(wrong.fit, [wind]))
     foretold = found.exchanges["frame_tilt", 0]
     assert wrong.score < foretold.score < windy.score + 1.0  # at the wrong model's noise, which is the larger
     assert found.neighbours[frozenset(["wind"])] == foretold
@@ -190,9 +190,10 @@ def test_an_exchange_weighs_what_the_whole_linear_system_says(sets):
     ((one, width),) = member.beside
     assert member.gone == (0,)
     size, first = len(screen.candidates[one].strengths), len(screen.priors.base)
+    tracks = screen.tracks[screen._noise(member.beside, member.gone)[0]]
     end = first + sum(len(h.strengths) for h in screen.candidates[:one])
-    listed = np.array([*range(first), *range(end, end + size), screen.tracks.gram.shape[-1] - 1])
-    part = Reduced(screen.tracks.constant, screen.tracks.gram[:, listed[:, None], listed])
+    listed = np.array([*range(first), *range(end, end + size), tracks.gram.shape[-1] - 1])
+    part = Reduced(tracks.constant, tracks.gram[:, listed[:, None], listed])
     sizes = WIDTHS[width] * scales(screen.candidates[one])
     precision = np.append(screen.priors.held([0], model.widths), sizes**-2)
     away = np.append(screen.priors.away, np.zeros(size))

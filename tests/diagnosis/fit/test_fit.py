@@ -11,8 +11,8 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from ballfg.diagnosis.fit.fit import first_guess, fit_problem, noise_by_axis, reachable
-from ballfg.diagnosis.fit.free import declared_free
-from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit, Noise, Problem, Unknowns, launch_axes
+from ballfg.diagnosis.fit.free import Unknowns, declared_free
+from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit, Noise, Problem, launch_axes
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.model import substitute
 from ballfg.dynamics.motion.paths import paths

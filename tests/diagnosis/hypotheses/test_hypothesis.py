@@ -7,17 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.fit.effects import has_effect, with_effects, without_effect
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.sensitivity import predict
-from ballfg.diagnosis.hypotheses.hypothesis import (
-    LOOSE,
-    Hypothesis,
-    has_effect,
-    hypotheses,
-    scene_of,
-    with_effects,
-    without_effect,
-)
+from ballfg.diagnosis.hypotheses.hypothesis import LOOSE, Hypothesis, hypotheses, scene_of
 from ballfg.dynamics import EFFECTS
 from ballfg.dynamics.effect import Scene
 from ballfg.dynamics.effects.flight import DragSpeed, GustRegion, Wind

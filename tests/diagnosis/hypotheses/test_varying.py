@@ -11,7 +11,8 @@ import pytest
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import weigh
 from ballfg.diagnosis.fit.fit import covariance_of, fit_model, fit_problem
-from ballfg.diagnosis.fit.problem import Fit, Unknowns
+from ballfg.diagnosis.fit.free import Unknowns
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_columns

@@ -13,7 +13,8 @@ import pytest
 import ballfg as bf
 from ballfg.benchmarks.cameras.strokes import MODEL, SETTINGS, SURFACES
 from ballfg.diagnosis import write_report
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, with_effects
+from ballfg.diagnosis.fit.effects import with_effects
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.one_view.diagnosis import diagnose_one_view, errors_across, told, with_values
 from ballfg.diagnosis.one_view.picture import CLOCK, ERRORS, LENS, Picture
 from ballfg.diagnosis.one_view.search import Found

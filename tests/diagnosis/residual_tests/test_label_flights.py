@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis import hold_out
-from ballfg.diagnosis.hypotheses.hypothesis import with_effects
+from ballfg.diagnosis.fit.effects import with_effects
 from ballfg.diagnosis.residual_tests.label_check import labelled_flights, scattering_model
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.effects.measurement import SpinLabelScale

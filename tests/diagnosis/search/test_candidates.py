@@ -13,8 +13,9 @@ import torch
 
 from ballfg.diagnosis.evidence.rows import random_motion
 from ballfg.diagnosis.evidence.weighed import weigh
+from ballfg.diagnosis.fit.effects import without_effect
 from ballfg.diagnosis.fit.fit import values_of
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.search.refits import FRAMES_FITTED, frame_hypotheses, refit, refit_driven
 from ballfg.diagnosis.search.score import ALARM, Score, Scored
 from ballfg.diagnosis.search.trial import LEAST_GAIN, MOST_REFITS, leading_sets, score_all, screened, shortlist

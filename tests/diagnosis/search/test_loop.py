@@ -10,9 +10,10 @@ import pytest
 
 from ballfg.diagnosis.evidence.rows import NAMELESS
 from ballfg.diagnosis.evidence.weighed import weighed
+from ballfg.diagnosis.fit.effects import has_effect, without_effect
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
-from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, has_effect, without_effect
+from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.varying import Grouping, Varying
 from ballfg.diagnosis.result import Errors, Outcome
 from ballfg.diagnosis.search.found import Found
@@ -313,9 +314,26 @@ def test_where_something_nameless_remains_the_search_begins_again(make_ball, mak
     assert all(len(one.added) <= 1 for one in found.rounds[begun:])
 
 
+@pytest.mark.parametrize("offered", [["distortion"], ["distortion", "drag_spin"]])
+def test_a_wrong_effect_alone_gets_no_name(make_ball, make_launches, make_shots, offered):
+    """Drag that grows with the spin, and a lens that distorts shots with and without spin alike."""
+    parts = []
+    for seed in (9, 10):
+        launches = make_launches(24, seed, spread=0.1, spin=10.0)
+        launches[::4, 7] += 150.0
+        launches[1::4, 7] += 150.0
+        parts.append(make_shots(make_ball(drag_spin={"gain": 1.5}), launches, seed, rate=60.0).stretches)
+    catalogue = [EFFECTS[name] for name in offered]
+    search = SearchLoop(holdout(*parts), catalogue, predicts_well, judges_alike, unwatched, of_some=[]).run(make_ball())
+    assert [finding.name for finding in search.findings] == [name for name in offered if name == "drag_spin"]
+    assert search.odds.of("distortion") < 0.05
+    assert (search.odds.nameless > 0.99) is ("drag_spin" not in offered)
+
+
 def test_a_model_that_the_last_round_made_shares_its_probability_with_its_neighbours(gusty, gusty_first):
     """A search that ends with as many effects as may be has not looked beyond them."""
     found = Found(gusty, gusty_first)
+    found.together = 1
     assert found.round()
     last = found.best
     assert last.names == {"frame_tilt"}
@@ -339,9 +357,10 @@ def test_the_best_minimum_of_the_same_effects_counts(gusty, gusty_first):
 def test_a_poorer_minimum_of_a_smaller_model_is_left_once_from_a_larger_one(gusty, gusty_first):
     """A refit from there starts where the larger one's linearisation leads, and counts from then on."""
     found = Found(gusty, gusty_first)
-    nothing = found.best
+    nothing, found.together = found.best, 1
     assert found.round()
     larger = found.best
+    found.tried.clear()  # the round may have asked already
     poorer = replace(nothing, evidence=nothing.evidence - 1e4)
     found.models[frozenset()] = poorer
     assert found._smaller(larger)[frozenset()] > found.scores[frozenset()]
@@ -417,7 +436,7 @@ def test_an_effect_that_differs_between_tracks_stays_without_its_value_for_all(g
     assert has_effect(rest.fit.problem.model, "wind")
     assert set(rest.fit.problem.deviations) == {"flight.wind.x[from 005]"}
     assert "flight.wind.x" not in rest.fit.problem.free
-    assert rest.score == pytest.approx(alone.score, abs=2.0)  # the last steps are not worth making
+    assert rest.score > alone.score - 2.0  # the last steps are not worth making; another side may have a better minimum
     nothing = found.without([wind, drift], both)
     assert nothing.names == frozenset()
     assert not has_effect(without_at_shapes(both, [wind, drift], found.first).problem.model, "wind")

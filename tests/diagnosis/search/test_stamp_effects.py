@@ -18,9 +18,9 @@ import pytest
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.budget import EXPECTED
 from ballfg.diagnosis.error_budget import error_budget
+from ballfg.diagnosis.fit.effects import with_effects
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.stamps import Evidence, Stamps
-from ballfg.diagnosis.hypotheses.hypothesis import with_effects
 from ballfg.diagnosis.report.wording import in_plain_words
 from ballfg.diagnosis.search.stamp_effects import (
     as_declared,

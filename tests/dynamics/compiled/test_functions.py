@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.hypotheses.hypothesis import has_effect, with_effects
+from ballfg.diagnosis.fit.effects import has_effect, with_effects
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model, rollout
 from ballfg.dynamics.compiled import functions
 from ballfg.dynamics.compiled.build import built

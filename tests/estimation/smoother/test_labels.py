@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.hypotheses.hypothesis import with_effects
+from ballfg.diagnosis.fit.effects import with_effects
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.effects.flight import DragSpin
 from ballfg.estimation.launcher import Launcher
