@@ -181,10 +181,8 @@ class Found(WeighedModels):
             self.add(Sets.near(screen, MOST_EFFECTS))
         scores = self.scores
         able = [*self.models, *(n for sets in self.sets for n in sets.members)]
-        names = max(
-            (n for n in able if n in scores), key=lambda names: scores[names]
-        )  # sets about older paths may lack
-        self.best = self.model(names)
+        known = [n for n in able if n in scores]  # sets about the path of a model in a poorer minimum are not
+        self.best = self.model(max(known, key=lambda names: scores[names]))
 
     @cached_property
     def ways(self) -> list[Grouping]:
