@@ -1,4 +1,4 @@
-"""What tracks have of their own: what their coefficients, and the air, differ by from those of all tracks."""
+"""Finds what tracks have of their own: what their coefficients and the air differ by from those of all tracks."""
 
 from collections.abc import Sequence
 

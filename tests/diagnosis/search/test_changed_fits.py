@@ -19,7 +19,7 @@ def test_steps_of_the_fit_are_tried_where_the_linearised_step_ends_below_what_it
 ):
     """Wind and a tilted frame, then the wind alone: the more probable one of both ways counts."""
     true = make_ball(wind={"x": 0.5, "y": -0.3})
-    fit = make_fit(make_ball(), make_shots(true, make_launches(16, 11), 11, rate=40.0).stretches)
+    fit = make_fit(make_ball(), make_shots(true, make_launches(16, 13), 13, rate=40.0).stretches)
     wind, tilt = (
         next(h for h in hypotheses(fit.problem.model, scene_of(fit), [EFFECTS[n]])) for n in ("wind", "frame_tilt")
     )

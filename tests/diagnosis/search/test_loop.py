@@ -354,14 +354,15 @@ def test_the_best_minimum_of_the_same_effects_counts(gusty, gusty_first):
     assert found.models == {frozenset(): better}
 
 
-def test_a_poorer_minimum_of_a_smaller_model_is_left_once_from_a_larger_one(gusty, gusty_first):
+def test_a_poorer_minimum_of_a_smaller_model_is_left_once_from_a_larger_one(leaning, make_ball):
     """A refit from there starts where the larger one's linearisation leads, and counts from then on."""
-    found = Found(gusty, gusty_first)
+    found = Found(leaning, first_fit(make_ball(), leaning.holdout))
     nothing, found.together = found.best, 1
     assert found.round()
     larger = found.best
     found.tried.clear()  # the round may have asked already
-    poorer = replace(nothing, evidence=nothing.evidence - 1e4)
+    less = 1e4 / len(nothing.held_out)  # nor does the other half bear it out
+    poorer = replace(nothing, evidence=nothing.evidence - 1e4, held_out=nothing.held_out - less)
     found.models[frozenset()] = poorer
     assert found._smaller(larger)[frozenset()] > found.scores[frozenset()]
     again = found.without(larger.named)
