@@ -220,7 +220,7 @@ def differing(search: Search) -> list[str]:
         coefficient = listed[full]
         if size < TOLD * spread(coefficient) or full in OWN_AIR[1:]:
             continue
-        name = "the air" if full in OWN_AIR else full.partition(".")[2]
+        name = "the wind" if full in OWN_AIR else full.partition(".")[2]
         share = f" ({100.0 * size / abs(values[full]):.2g} %)" if values.get(full) else ""
         told.append(f"{name} by {sized(size, coefficient.unit)}{share}")
     return [f"From track to track differ: {', '.join(told)}."] if told else []

@@ -41,10 +41,8 @@ class Noise:
     @property
     def calm(self) -> "Noise":
         """The same without such differences."""
-        return replace(
-            self,
-            random=tuple(min(size, ALMOST_NONE) if k >= COEFFICIENTS else size for k, size in enumerate(self.random)),
-        )
+        calm = (min(size, ALMOST_NONE) for size in self.random[COEFFICIENTS:])
+        return replace(self, random=(*self.random[:COEFFICIENTS], *calm))
 
     @classmethod
     def least(cls, rows: Sequence[Rows]) -> "Noise":

@@ -37,7 +37,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives of the evidence by the logarithms of the sizes: slope (9,) and average information (9, 9).
+    """Derivatives of the evidence by the logarithms of the s sizes: slope (s,) and average information (s, s).
 
     `along` are, of each batch, the factors (n, d) of the columns start, random, common, residual whose sum is the
     residual at the mean, one for the residual.
@@ -151,11 +151,11 @@ def slopes_at(
 class _Shown:
     """What one batch shows of the sizes."""
 
-    squares: Array  # (8,) expected ones over the variance, of spins and random columns by their kinds
+    squares: Array  # (s - 1,) expected ones over the variance, of spins and random columns by their kinds
     unknowns: int  # Number of first states and random columns
     along: Array  # (n, d) as of `Slopes`
-    products: Array  # (9, 9) inner products of what each size's rows or columns show, less what local unknowns absorb
-    common: Array  # (c, 9) their inner products with the common columns, less the same
+    products: Array  # (s, s) inner products of what each size's rows or columns show, less what local unknowns absorb
+    common: Array  # (c, s) their inner products with the common columns, less the same
 
 
 def _shown(likelihood: Likelihood, noise: Noise, local: Local, found: Posterior) -> _Shown:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -23,7 +24,7 @@ from ballfg.diagnosis.evidence.sizes import (
     climbed,
     next_damping,
 )
-from ballfg.diagnosis.fit.fit import followed, with_guesses
+from ballfg.diagnosis.fit.fit import alike, followed, with_guesses
 from ballfg.diagnosis.fit.free import OWN_AIR
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
@@ -88,6 +89,11 @@ class Weighed(Weight):
     def names(self) -> frozenset[str]:
         """Names of the effects, with `NAMELESS` for patterns without a name."""
         return frozenset(h.name for h in self.named) | frozenset([NAMELESS] * self.nameless)
+
+    @cached_property
+    def alike(self) -> Fit:
+        """Its fit without what tracks have of their own, from which refits start."""
+        return alike(self.fit)
 
     @property
     def start(self) -> Start:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from ballfg.diagnosis.evidence.odds import Odds
-from ballfg.diagnosis.fit.fit import alike, fit_problem
+from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.varying import Grouping
@@ -77,7 +77,7 @@ class SearchLoop:
         stamps, odds = self.holdout.stamps, found.odds
         final = found.named_at(self.name_at)
         plain = found.plain(final)
-        whole = alike(plain.fit)
+        whole = plain.alike
         if final.nameless and final.named:
             whole = with_strengths_of(final, whole)
         self.watch("predicting the other half")

@@ -229,7 +229,7 @@ def smaller_fit(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:
         found = Fit.at(problem, kept, fit.noise)
         if np.isfinite(found.cost):
             return found
-    return without_named(fit, gone, first)
+    return without_named(model.alike, gone, first)
 
 
 def weighed_without(model: Weighed, gone: Sequence[Hypothesis], first: Fit, motion: Motion, halves: Mask) -> Weighed:
@@ -242,7 +242,7 @@ def weighed_without(model: Weighed, gone: Sequence[Hypothesis], first: Fit, moti
     foretold = model.nested.get(model.names - {h.name for h in gone})
     if foretold is None or found.score > foretold.score - WORTH_A_STEP:
         return found
-    other = without_named(model.fit, gone, first)
+    other = without_named(model.alike, gone, first)
     if not np.isfinite(other.cost):
         return found
     return max(found, weighed(other, kept, motion, halves, model), key=lambda one: one.score)

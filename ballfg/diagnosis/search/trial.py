@@ -12,7 +12,6 @@ from ballfg.diagnosis.evidence.rows import Motion, Patterns, random_motion
 from ballfg.diagnosis.evidence.screen import Screen
 from ballfg.diagnosis.evidence.weighed import Weighed
 from ballfg.diagnosis.fit.effects import has_effect
-from ballfg.diagnosis.fit.fit import alike
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis, hypotheses, scene_of
 from ballfg.diagnosis.hypotheses.signatures import columns_of, hypothesis_signatures
@@ -49,7 +48,7 @@ def screened(model: Weighed, testable: Sequence[Hypothesis], motion: Motion) -> 
     """
     columns = columns_of(model.fit, testable)
     screen = Screen.of(model, motion, testable, columns)
-    fit = alike(model.fit)  # a score takes what tracks have alike from all that an effect could explain
+    fit = model.alike  # a score takes what tracks have alike from all that an effect could explain
     scores = score_tests(*hypothesis_signatures(fit, testable, columns if fit is model.fit else None))
     scored = []
     for hypothesis, score, gain in zip(testable, scores, screen.gains, strict=True):
@@ -115,7 +114,7 @@ def try_varying(
 def _refit_placed(model: Weighed, motion: Motion, candidate: Scored, closer: Sequence[Varying]) -> Refit:
     """The refit with a change along the recording at its best place."""
     best = _placed(model, motion, closer) if len(closer) > 1 else candidate
-    return refit(model.fit, replace(best, p_value=candidate.p_value))
+    return refit(model.alike, replace(best, p_value=candidate.p_value))
 
 
 def _alone(before: Fit, leading: Sequence[Scored]) -> list[Attempt]:
@@ -200,7 +199,7 @@ def try_hypotheses(
 
     Args: weighed: the model without any of them.  motion: random columns of its fit.  most: effects in a set.
     """
-    before, model = weighed.fit, weighed.fit.problem.model
+    before, model = weighed.alike, weighed.fit.problem.model
     testable, driven = _offered(weighed, catalogue)
     tell(f"testing {len(testable) + len(driven)} hypotheses")
     scored, screen = screened(weighed, testable, motion)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.diagnosis import differing
 from ballfg.diagnosis.evidence.rows import COEFFICIENTS, random_motion
 from ballfg.diagnosis.evidence.sizes import LEAST
 from ballfg.diagnosis.evidence.weighed import weigh
@@ -23,6 +26,16 @@ from ballfg.dynamics import EFFECTS
 
 DRAG, RESTITUTION = "flight.drag.k", "bounce.restitution.e"
 COUNT = 30
+FLOWN = {"rate": 80.0, "duration": 0.9, "noise": 0.0006}
+
+
+def shots_of(balls, launches, make_shots):
+    """One shot of each ball."""
+    parts = []
+    for k, ball in enumerate(balls):
+        one = make_shots(ball, launches[k : k + 1], k, **FLOWN).stretches
+        parts.append(replace(one, names=(f"{k:03d}",), track=np.array([k])))
+    return joined(parts)
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +48,11 @@ def own():
 @pytest.fixture(scope="module")
 def scattered(make_ball, make_launches, make_shots, make_fit, own):
     """A fit of one ball to tracks each of which has its own drag, restitution and wind."""
-    launches = make_launches(COUNT, 5)
-    parts = []
-    for k, (drag, restitution, x, y) in enumerate(own.tolist()):
-        ball = make_ball(drag={"k": 0.12 + drag}, restitution={"e": 0.87 + restitution}, wind={"x": x, "y": y})
-        one = make_shots(ball, launches[k : k + 1], k, rate=80.0, duration=0.9, noise=0.0006).stretches
-        parts.append(replace(one, names=(f"{k:03d}",), track=np.array([k])))
-    return make_fit(make_ball(), joined(parts))
+    balls = [
+        make_ball(drag={"k": 0.12 + drag}, restitution={"e": 0.87 + restitution}, wind={"x": x, "y": y})
+        for drag, restitution, x, y in own.tolist()
+    ]
+    return make_fit(make_ball(), shots_of(balls, make_launches(COUNT, 5), make_shots))
 
 
 @pytest.fixture(scope="module")
@@ -84,9 +95,7 @@ def test_scatter_gives_no_effect_a_gain(scattered, weighed_scattered):
 
 
 def test_nothing_scatters_where_tracks_are_alike(make_ball, make_launches, make_shots, make_fit):
-    fit = make_fit(
-        make_ball(), make_shots(make_ball(), make_launches(20, 6), 6, rate=80.0, duration=0.9, noise=0.0006).stretches
-    )
+    fit = make_fit(make_ball(), make_shots(make_ball(), make_launches(20, 6), 6, **FLOWN).stretches)
     model = weigh(fit)
     sizes = np.exp(model.noise.random)[random_motion(fit).own_kinds] * random_motion(fit).units
     found = dict(zip(random_motion(fit).spread, sizes, strict=True))
@@ -99,14 +108,9 @@ def test_a_wind_of_all_beside_the_winds_of_tracks_is_known_as_well_as_these_allo
     make_ball, make_launches, make_shots, make_fit
 ):
     """Its error is the scatter over the root of the number of tracks, far more than the noise of samples."""
-    rng, launches, parts = np.random.default_rng(8), make_launches(COUNT, 9), []
-    winds = 0.4 + 0.3 * rng.standard_normal(COUNT)
-    for k, x in enumerate(winds.tolist()):
-        one = make_shots(
-            make_ball(wind={"x": x}), launches[k : k + 1], k, rate=80.0, duration=0.9, noise=0.0006
-        ).stretches
-        parts.append(replace(one, names=(f"{k:03d}",), track=np.array([k])))
-    fit = make_fit(make_ball(), joined(parts))
+    winds = 0.4 + 0.3 * np.random.default_rng(8).standard_normal(COUNT)
+    balls = [make_ball(wind={"x": x}) for x in winds.tolist()]
+    fit = make_fit(make_ball(), shots_of(balls, make_launches(COUNT, 9), make_shots))
     (wind,) = hypotheses(fit.problem.model, scene_of(fit), [EFFECTS["wind"]])
     model = weigh(refit(fit, Scored(wind, None, 0.0)).fit, [wind])
     found = model.strengths["wind"]
@@ -127,3 +131,16 @@ def test_columns_of_own_coefficients_are_those_of_differences(scattered, name):
         ends.append(moved.weighted_residual(scattered.robust))
     differences = (ends[1] - ends[0]) / (2.0 * step)
     assert np.abs(columns - differences).max() < 1e-4 * np.abs(differences).max()
+
+
+def test_a_search_tells_what_differs_and_how_well_the_mean_is_known(scattered, weighed_scattered, own):
+    """The error of a coefficient of all tracks is at least its scatter over the root of their number."""
+    search = SimpleNamespace(whole=scattered, scatter=weighed_scattered.scatter)
+    (sentence,) = differing(search)
+    found = re.findall(r"(drag\.k|restitution\.e|the wind) by ([\d.]+)", sentence)
+    assert [name for name, _ in found] == ["drag.k", "restitution.e", "the wind"]
+    expected = (own[:, 0].std(), own[:, 1].std(), 0.3 * np.sqrt(2.0 / 3.0))
+    assert [float(size) for _, size in found] == pytest.approx(expected, rel=0.35)
+    for place, name in enumerate((DRAG, RESTITUTION)):
+        assert weighed_scattered.sigmas[name] > 0.7 * own[:, place].std() / np.sqrt(COUNT)
+    assert differing(SimpleNamespace(whole=scattered, scatter=dict.fromkeys(weighed_scattered.scatter, 1e-6))) == []
