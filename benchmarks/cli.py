@@ -226,7 +226,7 @@ def loop(
     """Test of the diagnosis: planted effects that it names, false alarms, and models that it repairs.
 
     The simulated datasets hold every catalogue effect in several sizes, pairs of effects, nothing that the model lacks,
-    or physics of no catalogue; the ideal test of each effect alone stands beside them. --data adds measured tracks,
+    or physics of no catalogue. --data adds measured tracks,
     diagnosed with the nominal model and with gravity, drag and the bounce only. Finished parts are kept in OUT/runs, so
     that a stopped run can be continued. --reliability makes other sets, with up to three effects of random size, and
     compares the stated probability of each name with the share of right names.

@@ -4,7 +4,7 @@ Planted is every catalogue effect at its own usual size, in pairs, and physics o
 """
 
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS, nominal_model
 from ballfg.simulation.settings import SETTING_LEVELS
@@ -48,11 +47,6 @@ class Plant:
             return Hypothesis(EFFECTS[self.name], whole)
         shape = {c.name: c.default for c in coefficients if c.absent is None}
         return Hypothesis(EFFECTS[self.name], shape, tuple(c.name for c in coefficients if c.absent is not None))
-
-    def direction(self) -> Array:
-        """(p,) what size 1 adds to each strength of the hypothesis."""
-        amounts = dict(self.amounts)
-        return np.array([amounts.get(c, 0.0) for c in self.hypothesis().strengths])
 
 
 FIRST: Final = (
@@ -155,7 +149,6 @@ class Plan:
         unlabelled: names of effects planted in data without spin labels.  pairs: names of two planted together.
         seeds: of each at its typical size; the true model is fitted to the first of them.
         side_seeds: of each at other sizes, and of pairs.  unlabelled_seeds: where no spin is labelled.
-        ratios, detection_seeds: sizes over the ideal test's, and seeds at each, where the detection limit is sought.
         nulls: datasets that lack nothing.  unknown, unknown_seeds: physics outside the catalogue.
         timed: diagnoses that are timed alone.
         reliability: sets for the test of stated probabilities, which is a run of its own.
@@ -168,8 +161,6 @@ class Plan:
     seeds: int = 4
     side_seeds: int = 1
     unlabelled_seeds: int = 2
-    ratios: tuple[float, ...] = (1.0, 1.5, 2.0)
-    detection_seeds: int = 2
     nulls: int = 100
     unknown: tuple[str, ...] = tuple(UNKNOWN)
     unknown_seeds: int = 3
@@ -186,8 +177,6 @@ QUICK: Final = Plan(
     seeds=1,
     side_seeds=1,
     unlabelled_seeds=1,
-    ratios=(),
-    detection_seeds=0,
     nulls=5,
     unknown=FULL.unknown[:2],
     unknown_seeds=1,
@@ -214,12 +203,6 @@ def naming_cases(plan: Plan, seed: int) -> Iterator[Case]:
         yield Case("pairs", f"{one}+{other}", 1.0, number, (one, other), left_out, (texts,))
     for number, name in product(range(seed, seed + plan.unlabelled_seeds), plan.unlabelled):
         yield replace(planted_case("no_labels", name, 1.0, number), recording=Recording(labels=False))
-
-
-def detection_cases(plan: Plan, seed: int, ideal: Mapping[str, float]) -> Iterator[Case]:
-    """The effects that are to be detected at sizes about the `ideal` one, which the ideal test needs."""
-    for number, (name, size), ratio in product(range(seed, seed + plan.detection_seeds), ideal.items(), plan.ratios):
-        yield planted_case("detection", name, float(f"{ratio * size:.4g}"), number)
 
 
 def null_cases(plan: Plan, seed: int) -> Iterator[Case]:
@@ -279,17 +262,16 @@ def timed_cases(plan: Plan, seed: int) -> Iterator[Case]:
         yield replace(planted_case("time", "wind", 1.0, number), jobs=2)
 
 
-def all_cases(plan: Plan, seed: int, ideal: Mapping[str, float], data: Sequence[Path]) -> list[Case]:
+def all_cases(plan: Plan, seed: int, data: Sequence[Path]) -> list[Case]:
     """Everything that may run side by side, parts evenly mixed: an early look sees something of all.
 
-    Args: ideal: by effect, the size that the ideal test needs.  data: folders of measured tracks.
+    Args: data: folders of measured tracks.
     """
     parts = [
         list(measured_cases(data)),
         list(naming_cases(plan, seed)),
         list(null_cases(plan, seed)),
         list(unknown_cases(plan, seed)),
-        list(detection_cases(plan, seed, ideal)),
     ]
     placed = [(number / len(part), case) for part in parts for number, case in enumerate(part)]
     return [case for _, case in sorted(placed, key=lambda pair: pair[0])]

@@ -1,4 +1,4 @@
-"""Draws the loop's benchmark: power against size, named against planted effects, and repaired errors."""
+"""Draws the loop's benchmark: named against planted effects, and repaired errors."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,62 +6,14 @@ from typing import Final
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 
 from ballfg.benchmarks.diagnosis.cases import Case
-from ballfg.benchmarks.diagnosis.ideal import NAMED, Curve, Ideal
 from ballfg.benchmarks.diagnosis.record import Record
-from ballfg.benchmarks.diagnosis.rows import ALL, detectable, of_part, power_curves
-from ballfg.benchmarks.metrics import share
-from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, plain_ticks, save
+from ballfg.benchmarks.diagnosis.rows import ALL, of_part
+from ballfg.benchmarks.pictures import BLUE, ORANGE, plain_ticks, save
 from ballfg.benchmarks.results import Row
 
-COLUMNS: Final = 5  # Panels side by side
 NOTHING: Final = "nothing"  # Column of the diagnoses that named no effect
-FEW_DECADES: Final = 100.0  # Ratio of the largest to the smallest size up to which more than the decades are numbered
-POINTS: Final = 200  # Number of points of a drawn curve
-
-
-def power_picture(
-    cases: Sequence[Case], records: Mapping[str, Record], ideals: Mapping[str, Ideal], path: Path
-) -> Path:
-    """Share named right against the size, a panel for each effect that can be seen, with the ideal test's power."""
-    seen = detectable(ideals)
-    curves = {name: found for name, found in power_curves(cases, records, ideals).items() if name in seen}
-    rows = -(-len(curves) // COLUMNS)
-    figure, panels = plt.subplots(
-        rows, COLUMNS, figsize=(2.9 * COLUMNS, 2.3 * rows + 0.8), sharey=True, squeeze=False, layout="constrained"
-    )
-    for axes, (name, (sizes, outcomes, curve)) in zip(panels.flat, curves.items(), strict=False):
-        _draw_power(axes, sizes, outcomes, curve, ideals[name])
-        axes.set_title(name, size=10)
-    for axes in panels.flat[len(curves) :]:
-        axes.set_axis_off()
-    for axes in panels[:, 0]:
-        axes.set_ylabel("share")
-    figure.supxlabel("size of the effect, 1 is typical", size=10)
-    figure.suptitle("Named first, against the size of what was planted; bars: 95 % of a share", size=11)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize="small")
-    return save(figure, path)
-
-
-def _draw_power(axes: Axes, sizes: Sequence[float], outcomes: Sequence[bool], curve: Curve, ideal: Ideal) -> None:
-    tried = sorted(set(sizes))
-    shares = [share([outcome for s, outcome in zip(sizes, outcomes, strict=True) if s == size]) for size in tried]
-    values = np.array([one.value for one in shares])
-    ends = np.maximum(0.0, [values - [one.low for one in shares], [one.high for one in shares] - values])
-    axes.errorbar(tried, values, ends, color=BLUE, fmt="o", markersize=4, linewidth=0.8, capsize=2, label="loop")
-    low, high = min(sizes), max(sizes)
-    if np.isfinite(ideal.size):
-        low, high = min(low, 0.5 * ideal.size), max(high, 1.5 * ideal.size)
-    grid = np.geomspace(low, high, POINTS)
-    axes.plot(grid, ideal.power(grid), color=GREY, label="ideal test")
-    axes.plot(grid, curve.at(grid), color=BLUE, linewidth=1.0, alpha=0.6, label="curve through the loop's")
-    axes.axhline(NAMED, color="black", linewidth=0.5, linestyle=":")
-    axes.set(xscale="log", ylim=(-0.05, 1.05))
-    plain_ticks(axes.xaxis, (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,))
-    axes.grid(visible=True, alpha=0.25)
 
 
 def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path: Path) -> Path:

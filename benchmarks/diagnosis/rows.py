@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from ballfg.benchmarks.diagnosis.cases import BARE, PLANTS, STATED_NOISE, Case
-from ballfg.benchmarks.diagnosis.ideal import Curve, Ideal, power_curve
-from ballfg.benchmarks.diagnosis.record import Record, alarmed, complete, false_names, named, right
+from ballfg.benchmarks.diagnosis.record import Record, alarmed, complete, false_names, right
 from ballfg.benchmarks.metrics import median_and_range, share
 from ballfg.benchmarks.results import Results
 from ballfg.diagnosis.result import Verdict
@@ -17,15 +16,12 @@ TITLES = {
     "naming": "naming, spin labels",
     "no_labels": "naming, no spin labels",
     "pairs": "pairs",
-    "detection": "detection limit",
     "silence": "silence",
     "unknown": "unknown physics",
     "measured": "measured",
     "time": "time",
 }
 """The name in `results.json` of each part's rows."""
-LARGEST_IDEAL = 2.0
-"""Largest multiple of its typical size that the ideal test may need for a search at an effect's limit."""
 FEW_TRACKS = 25  # Null datasets of so many tracks are also counted apart
 
 Records = Mapping[str, Record]
@@ -36,12 +32,11 @@ def of_part(cases: Sequence[Case], part: str) -> list[Case]:
     return [case for case in cases if case.part == part]
 
 
-def add_all(results: Results, cases: Sequence[Case], records: Records, ideals: Mapping[str, Ideal]) -> None:
+def add_all(results: Results, cases: Sequence[Case], records: Records) -> None:
     """The rows of every part; of each the number of failed cases, where there are some."""
     for part in ("naming", "no_labels"):
         _add_naming(results, of_part(cases, part), records, TITLES[part])
     _add_pairs(results, of_part(cases, "pairs"), records)
-    _add_detection(results, cases, records, ideals)
     _add_silence(results, of_part(cases, "silence"), records)
     _add_repair(results, [case for case in cases if case.repair and case.name in records], records)
     _add_unknown(results, of_part(cases, "unknown"), records)
@@ -93,41 +88,6 @@ def _add_pairs(results: Results, cases: Sequence[Case], records: Records) -> Non
         both = [case.name in records and complete(records[case.name], case.planted) for case in chosen]
         _add_share(results, "pairs", "first", line, [_right(case, records) for case in chosen])
         _add_share(results, "pairs", "both", line, both)
-
-
-def detectable(ideals: Mapping[str, Ideal]) -> dict[str, float]:
-    """The ideal test's sizes of the effects with a detection limit."""
-    return {name: ideal.size for name, ideal in ideals.items() if ideal.size <= LARGEST_IDEAL}
-
-
-def power_curves(
-    cases: Sequence[Case], records: Records, ideals: Mapping[str, Ideal]
-) -> dict[str, tuple[list[float], list[bool], Curve]]:
-    """By effect: the sizes tried, whether each was named, and the curve through them."""
-    curves = {}
-    listed = [*of_part(cases, "naming"), *of_part(cases, "detection")]
-    for name in ideals:
-        own = [case for case in listed if case.subject == name]
-        sizes = [case.size for case in own]
-        outcomes = [case.name in records and named(records[case.name], case.planted) for case in own]
-        curves[name] = (sizes, outcomes, power_curve(sizes, outcomes))
-    return curves
-
-
-def _add_detection(results: Results, cases: Sequence[Case], records: Records, ideals: Mapping[str, Ideal]) -> None:
-    """The size that the ideal test needs, the one that the loop needs, in typical sizes, and their ratio."""
-    add, ratios = partial(results.add, TITLES["detection"]), []
-    curves = power_curves(cases, records, ideals)
-    tried = {case.subject for case in of_part(cases, "detection")} & detectable(ideals).keys()
-    for name, ideal in ideals.items():
-        add("ideal", name, "1", ideal.size, 1)
-        if name in tried:
-            sizes, _, curve = curves[name]
-            ratios.append(curve.limit / ideal.size)
-            add("loop", name, "1", curve.limit, len(sizes))
-            add("loop / ideal", name, "1", ratios[-1], len(sizes))
-    if ratios:
-        add("loop / ideal", "median", "1", median_and_range(ratios), len(ratios))
 
 
 def _add_silence(results: Results, cases: Sequence[Case], records: Records) -> None:

@@ -3,27 +3,23 @@
 import itertools
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeVar
 
 import numpy as np
 from scipy.stats import binom
 
 from ballfg.benchmarks.diagnosis.cases import PLANTS, Case, Plan, Recording, all_cases, timed_cases
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset, measured_dataset, true_errors
-from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of
 from ballfg.benchmarks.diagnosis.record import Record, case_digest, record_of
-from ballfg.benchmarks.diagnosis.rows import add_all, detectable
+from ballfg.benchmarks.diagnosis.rows import add_all
 from ballfg.benchmarks.metrics import CONFIDENCE, Figure
-from ballfg.benchmarks.results import RUNS_FOLDER, Kept, Results, collect
+from ballfg.benchmarks.results import RUNS_FOLDER, Results, collect
 from ballfg.diagnosis import diagnose
 from ballfg.diagnosis.hypotheses.hypothesis import TWINS
 from ballfg.diagnosis.result import Diagnosis
-
-K = TypeVar("K", bound=Kept)
 
 
 def run_case(case: Case, diagnose: Callable[..., Diagnosis] = diagnose) -> Record:
@@ -50,44 +46,23 @@ def collect_records(
 
     A case whose diagnosis raises has no record: stderr reports it, it counts as failed, and the next run repeats it.
     """
-
-    def tried(case: Case) -> Record | None:
-        try:
-            return run(case)
-        except Exception as error:  # counted as a failure of the diagnosis: one bad case must not end a long run
-            print(f"{case.name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-            return None
-
-    found = _collect(Record, {case.name: case for case in cases}, tried, out, jobs, "diagnoses finished")
-    return {name: record for name, record in found.items() if record is not None}
-
-
-def collect_ideals(
-    names: Iterable[str], seed: int, out: Path, jobs: int, compute: Callable[[Case], Ideal] = ideal_of
-) -> dict[str, Ideal]:
-    """The ideal tests of effects by name: read where they are there, else computed and kept."""
-    cases = {f"ideal-{name}": ideal_case(name, seed) for name in names}
-    found = _collect(Ideal, cases, compute, out, jobs, "ideal tests finished")
-    return {cases[name].subject: ideal for name, ideal in found.items() if ideal is not None}
-
-
-def _collect(
-    kind: type[K], cases: Mapping[str, Case], make: Callable[[Case], K | None], out: Path, jobs: int, what: str
-) -> dict[str, K | None]:
-    """Kept parts by the names of their files without the ending."""
-    folder = out / RUNS_FOLDER
+    folder, by_name = out / RUNS_FOLDER, {case.name: case for case in cases}
     folder.mkdir(exist_ok=True)
 
-    def finish(name: str) -> K | None:
-        made = make(cases[name])
-        if made is not None:
-            made.save(folder / f"{name}.json")
-        return made
+    def finish(name: str) -> Record | None:
+        try:
+            record = run(by_name[name])
+        except Exception as error:  # counted as a failure of the diagnosis: one bad case must not end a long run
+            print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+            return None
+        record.save(folder / f"{name}.json")
+        return record
 
-    def read(name: str) -> K | None:
-        return kind.read(folder / f"{name}.json", case_digest(cases[name]))
+    def read(name: str) -> Record | None:
+        return Record.read(folder / f"{name}.json", case_digest(by_name[name]))
 
-    return dict(zip(cases, collect(list(cases), read, finish, jobs, what), strict=True))
+    found = zip(by_name, collect(list(by_name), read, finish, jobs, "diagnoses finished"), strict=True)
+    return {name: record for name, record in found if record is not None}
 
 
 def run_loop(
@@ -97,25 +72,22 @@ def run_loop(
     plan: Plan,
     jobs: int,
     run: Callable[[Case], Record] = run_case,
-    ideal: Callable[[Case], Ideal] = ideal_of,
 ) -> list[Path]:
     """Plant, diagnose, judge, and add the rows. Finished cases are kept: a run that was stopped goes on where it was.
 
     Args: data: folders of measured tracks, for the part that needs some.  out: an existing folder.
     Returns: the pictures written.
     """
-    from ballfg.benchmarks.diagnosis.pictures import confusion_picture, power_picture, repair_picture
+    from ballfg.benchmarks.diagnosis.pictures import confusion_picture, repair_picture
 
     if not data:
         print("note: no --data: nothing measured is diagnosed", file=sys.stderr)
-    ideals = collect_ideals([n for n in plan.effects if PLANTS[n].sized], results.seed, out, jobs, ideal)
-    cases = all_cases(plan, results.seed, detectable(ideals), data)
+    cases = all_cases(plan, results.seed, data)
     records = collect_records(cases, out, jobs, run)
     timed = list(timed_cases(plan, results.seed))
     records |= collect_records(timed, out, 1, run)  # alone, one after the other
-    add_all(results, [*cases, *timed], records, ideals)
+    add_all(results, [*cases, *timed], records)
     return [
-        power_picture(cases, records, ideals, out / "loop_power.png"),
         confusion_picture(cases, records, out / "loop_first_finding.png"),
         repair_picture(results.rows, out / "loop_repair.png"),
     ]

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Record as Case
 from ballfg.benchmarks.dynamics.contenders import Record as Contender
 from ballfg.benchmarks.speed.stopwatch import SlowerError, check_ratios
@@ -102,7 +101,7 @@ def _record(folder: Path, file: Path) -> object:
             return check_ratios(timed_rows(), file)
         except SlowerError as answer:
             return answer
-    read = {"case": Case, "ideal": Ideal, "contender": Contender}[file.stem].read
+    read = {"case": Case, "contender": Contender}[file.stem].read
     return read(file, "d")
 
 

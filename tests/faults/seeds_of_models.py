@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record as CaseRecord
 from ballfg.benchmarks.dynamics.contenders import Fan, Record as ContenderRecord
 from ballfg.benchmarks.dynamics.task import PathScore
@@ -139,7 +138,6 @@ def write_records(folder: Path) -> None:
         ((Ranked("flight.wind", 0.5, 1e-9, 40.0, "taken"), Ranked("b", 0.1, 0.2, None, "left")),),
         {"before": 20.0, "after": 4.0}, {"stamps": 0.4}, 40, 20, 12.5,
     ).save(folder / "case.json")  # fmt: skip
-    Ideal("d", 2, 31.5).save(folder / "ideal.json")
     (folder / "results.json").write_text(json.dumps({"rows": [vars(row) for row in timed_rows()]}))
 
 

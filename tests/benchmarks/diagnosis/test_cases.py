@@ -17,7 +17,6 @@ from ballfg.benchmarks.diagnosis.cases import (
     UNKNOWN,
     Case,
     Recording,
-    detection_cases,
     measured_cases,
     naming_cases,
     null_cases,
@@ -84,7 +83,7 @@ def test_hypothesis_is_the_planted_effect(name: str) -> None:
     hypothesis = plant.hypothesis()
     assert hypothesis.name == name
     (effect,) = parse_effects(plant.texts(1.0))
-    reached = {c: plant.base + d for c, d in zip(hypothesis.strengths, plant.direction(), strict=True)}
+    reached = {c: plant.base + dict(plant.amounts).get(c, 0.0) for c in hypothesis.strengths}
     for coefficient in effect.coefficients:
         value = float(getattr(effect, coefficient.name).detach())
         expected = hypothesis.shape.get(coefficient.name, reached.get(coefficient.name))
@@ -107,7 +106,6 @@ def test_a_left_out_effect_takes_along_those_that_need_it() -> None:
 def test_cases_have_names_and_random_streams_of_their_own() -> None:
     cases = [
         *naming_cases(FULL, 0),
-        *detection_cases(FULL, 0, {"wind": 0.15, "scale": 0.2}),
         *null_cases(FULL, 0),
         *unknown_cases(FULL, 0),
         *timed_cases(FULL, 0),
@@ -119,7 +117,6 @@ def test_cases_have_names_and_random_streams_of_their_own() -> None:
     assert len(named) == FULL.seeds * len(PLANTS) + FULL.side_seeds * 2 * (
         len(PLANTS) - 1
     )  # the label frame has one size
-    assert [case.size for case in cases if case.part == "detection"][:3] == [0.15, 0.225, 0.3]
     assert not any("spin_label" in case.subject for case in cases if case.part == "no_labels")
     assert all(case.recording.labels is (case.part != "no_labels") for case in cases if case.part != "silence")
 
@@ -129,7 +126,6 @@ def test_quick_plan_is_small() -> None:
     assert len([case for case in cases if case.part == "naming"]) == 8
     assert {(case.size, case.seed) for case in cases} == {(1.0, 3)}
     assert len(list(null_cases(QUICK, 0))) == 5
-    assert not list(detection_cases(QUICK, 0, {"wind": 0.15}))
 
 
 def test_null_recordings_cover_what_they_should_and_can_be_simulated() -> None:

@@ -17,7 +17,6 @@ from ballfg.benchmarks.diagnosis.cases import (
     timed_cases,
 )
 from ballfg.benchmarks.diagnosis.data import planted_free
-from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import (
     Found,
     Ranked,
@@ -30,7 +29,7 @@ from ballfg.benchmarks.diagnosis.record import (
     record_of,
     right,
 )
-from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, add_all, detectable
+from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, add_all
 from ballfg.benchmarks.diagnosis.suite import collect_records, run_loop
 from ballfg.benchmarks.results import Results
 from tests.diagnosis.made_diagnosis import found, unexplained
@@ -43,8 +42,6 @@ SMALL = Plan(
     seeds=2,
     side_seeds=2,
     unlabelled_seeds=2,
-    ratios=(1.0, 2.0),
-    detection_seeds=2,
     nulls=3,
     unknown=("pull",),
     unknown_seeds=2,
@@ -179,11 +176,9 @@ def outcome(case: Case) -> Record:
 
 
 def test_rows_say_what_was_planned_and_found() -> None:
-    ideals = {"wind": Ideal("", 3, 900.0), "scale": Ideal("", 3, 60.0), "velocity_lag": Ideal("", 0, 0.0)}
-    assert set(detectable(ideals)) == {"wind", "scale"}
-    cases = [*all_cases(SMALL, 0, detectable(ideals), []), *timed_cases(SMALL, 0)]
+    cases = [*all_cases(SMALL, 0, []), *timed_cases(SMALL, 0)]
     results = Results("test", 0)
-    add_all(results, cases, {case.name: outcome(case) for case in cases}, ideals)
+    add_all(results, cases, {case.name: outcome(case) for case in cases})
     labels, typical, half = "naming, spin labels", "1 typical", "0.5 typical"
     assert results.value(labels, typical, "scale") == 1.0
     assert results.value(labels, half, "scale") == 0.0
@@ -191,11 +186,6 @@ def test_rows_say_what_was_planned_and_found() -> None:
     assert results.value(labels, typical, HIDDEN) == 1.0
     assert results.value("naming, no spin labels", typical, ALL) == 1.0
     assert (results.value("pairs", "first", ALL), results.value("pairs", "both", ALL)) == (1.0, 1.0)
-    assert results.value("detection limit", "loop / ideal", "wind") == pytest.approx(
-        1.0, abs=1e-3
-    )  # found at the least
-    assert 1.0 < results.value("detection limit", "loop / ideal", "scale") < 3.0  # type: ignore[operator]
-    assert results.value("detection limit", "ideal", "velocity_lag") is None
     assert results.value("silence", "effect named", ALL) == 0.0
     assert results.value("silence", "any alarm", ALL) == pytest.approx(1 / 3)
     assert results.value("repair", "after / true", "wind") == pytest.approx(10.0 / 8.0)
@@ -210,18 +200,18 @@ def test_a_case_without_a_record_is_wrong_and_counted() -> None:
     records = {case.name: outcome(case) for case in cases}
     del records["naming-wind-1-0"]
     results = Results("test", 0)
-    add_all(results, cases, records, {})
+    add_all(results, cases, records)
     assert results.value("naming, spin labels", "1 typical", "wind") == 0.5
     assert results.value("naming, spin labels", FAILED, ALL) == 1.0
 
 
 def test_measured_rows_name_what_was_found(tmp_path: Path) -> None:
     (tmp_path / "aimy").mkdir()
-    cases = [c for c in all_cases(QUICK, 0, {}, [tmp_path / "aimy"]) if c.part == "measured"]
+    cases = [c for c in all_cases(QUICK, 0, [tmp_path / "aimy"]) if c.part == "measured"]
     assert [case.name for case in cases] == ["measured-aimy-1-0", "measured-aimy-bare-1-0"]
     results = Results("test", 0)
     records = {cases[0].name: record(verdict="unexplained"), cases[1].name: record(("magnus",), ("wind_shear",))}
-    add_all(results, cases, records, {})
+    add_all(results, cases, records)
     assert results.value("aimy", "bare model", "delta_bic of finding 1, magnus") == -50.0
     assert results.value("aimy", "bare model", "after / before") == 0.5
     assert results.value("aimy", "nominal model", "unexplained") == 1.0
@@ -238,13 +228,9 @@ def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
             raise ValueError("tracks must be longer")
         return replace(outcome(case), digest=case_digest(case))
 
-    def ideal_of(case: Case) -> Ideal:
-        rank, information = (0, 0.0) if case.subject == "velocity_lag" else (3, 900.0)
-        return Ideal(case_digest(case), rank, information)
-
     results = Results("test", 0)
-    pictures = run_loop(results, [], tmp_path, SMALL, 1, run, ideal_of)
-    assert [picture.name for picture in pictures] == ["loop_power.png", "loop_first_finding.png", "loop_repair.png"]
+    pictures = run_loop(results, [], tmp_path, SMALL, 1, run)
+    assert [picture.name for picture in pictures] == ["loop_first_finding.png", "loop_repair.png"]
     assert all(picture.stat().st_size > 10_000 for picture in pictures)
     assert results.value("silence", FAILED, ALL) == 1.0
     said = capsys.readouterr().err
@@ -253,7 +239,7 @@ def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
     assert made[-1] == "time-wind-1-0"  # alone, after all others
     made.clear()
     again = Results("test", 0)
-    run_loop(again, [], tmp_path, SMALL, 1, run, ideal_of)
+    run_loop(again, [], tmp_path, SMALL, 1, run)
     assert made == ["silence-nothing-1-1"]  # what failed is tried again, nothing else
     assert again.rows == results.rows
 
