@@ -76,7 +76,7 @@ class Recordings:
             )
         if self.contents.smoothing > SMOOTHED:
             said.append(smoothed(self.contents.smoothing))
-        said += filter(None, [self.contents.others, self.contents.repeated])
+        said += filter(None, [self.contents.others, self.contents.repeated, self.contents.filled])
         if len(self.cut) < LEAST_TRACKS:
             said.append(FEW_TRACKS)
         return [*said, *clipped(self.tracks)]

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Mask
 from ballfg.dynamics.nominal import ready_nominal
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.flights.labels import FEWEST, SHORTEST, Labels, contrasts, label_samples, scatter
@@ -29,6 +29,9 @@ UNDISTURBED: Final = 0.2  # Quantile of that ratio: stretches with a bounce or a
 SMOOTHING: Final = "a filter smoothed the positions"
 OTHER: Final = "of another ball, or outliers"
 REPEATED: Final = "a tracker held or rounded them"
+FILLED: Final = "gaps were filled in"
+FILLS: Final = 0.01  # Share of the samples in flight from which filled ones are worth a doubt: measured ones never show
+EVENLY: Final = 0.5  # m/s^2. Acceleration between samples below which a ball in flight did not move by itself
 SPAN: Final = 0.25  # s, of the cubics whose residuals show the errors
 LEAST_SPAN: Final = 8  # Samples, likewise
 ROUNDING: Final = 2e-4  # m. Errors below are those of rounding, or of the cubics: 0.12 mm where drag is largest
@@ -76,7 +79,7 @@ class Contents:
         share: of the samples that are flight, 0 to 1.
         smoothing: ratio of slow to fast errors of the positions; 1 if they are white; NaN if unknown.
         others: sentence on samples that are not of the ball; empty without.
-        repeated: sentence on positions that are those of the sample before; empty without.
+        repeated, filled: sentences on positions that are those of the sample before, or on a line; empty without.
     """
 
     pieces: "dict[str, list[Piece] | None]"
@@ -84,26 +87,29 @@ class Contents:
     smoothing: float
     others: str
     repeated: str
+    filled: str
 
     @classmethod
     def of(cls, labelled: Iterable[tuple[Track, Labels]], whole: Callable[[Track, Labels], bool]) -> "Contents":
         """Of labelled tracks. Args: whole: True for a track that is used as a whole."""
         pieces: dict[str, list[Piece] | None] = {}
-        ratios, jumps, samples, flying, lost, again = list[Array](), list[float](), 0, 0, 0, 0
+        ratios, jumps, counts = list[Array](), list[float](), np.zeros(5)
         for track, labels in labelled:
             own = pieces[track.name] = None if whole(track, labels) else pieces_of(labels)
-            samples += len(track)
-            lost += int((labels.values == Label.LOST).sum())
-            same = (np.diff(track.positions, axis=0) == 0.0).all(axis=1)
-            again += int((same & (labels.values[1:] == Label.FLIGHT)).sum())
-            flying += len(track) if own is None else int((labels.values == Label.FLIGHT).sum())
+            lost, flight = labels.values == Label.LOST, labels.values == Label.FLIGHT
+            same = (np.diff(track.positions, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+            evenly = on_lines(track) & ~same & (flight | lost)
+            flying = len(track) if own is None else flight.sum()
+            counts += (len(track), flying, lost.sum(), (same & flight).sum(), evenly.sum())
             if len(pieces) <= LOOKED_AT:
                 ratios.append(error_ratios(track, labels))
                 jumps += [float(scatter(track.seconds, track.positions).max())] if len(track) >= FEWEST else []
+        samples, flying, lost, again, filled = counts.tolist()
         held = np.concatenate(ratios)
         smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
-        strange = others(lost / samples, float(np.median(jumps or [0.0])))
-        return cls(pieces, flying / samples, smoothing, strange, repeated(again / max(flying, 1)))
+        share, strange = flying / samples, others(lost / samples, float(np.median(jumps or [0.0])))
+        flying = max(flying, 1.0)
+        return cls(pieces, share, smoothing, strange, repeated(again / flying), filled_in(filled / flying))
 
 
 @dataclass(frozen=True)
@@ -134,9 +140,9 @@ class InFlight:
 
     @property
     def filtered(self) -> tuple[str, ...]:
-        """Sentences on smoothed or repeated positions and on other balls, unless `dataset.yaml` has them."""
+        """Sentences on smoothed, repeated or filled positions and on other balls, unless `dataset.yaml` has them."""
         found = {SMOOTHING: smoothed(self.held.smoothing)} if self.held.smoothing > SMOOTHED else {}
-        found |= {OTHER: self.held.others, REPEATED: self.held.repeated}
+        found |= {OTHER: self.held.others, REPEATED: self.held.repeated, FILLED: self.held.filled}
         known = " ".join(self.dataset.info.doubts)
         return tuple(said for sign, said in found.items() if said and sign not in known)
 
@@ -172,6 +178,28 @@ def repeated(share: float) -> str:
         f"{100 * share:.0f} % of the positions in flight repeat the one before them: {REPEATED}; leave the repeats "
         "out, or velocities lag and sigmas are too small"
     )
+
+
+def filled_in(share: float) -> str:
+    """The sentence on positions between measured ones; empty without. Args: share: of the samples of flying balls."""
+    if share <= FILLS:
+        return ""
+    return (
+        f"{100 * share:.0f} % of the positions in flight lie on straight lines, at even speed: {FILLED}; leave those "
+        "samples out, or the ball seems to fly straight on there and sigmas are too small"
+    )
+
+
+def on_lines(track: Track) -> Mask:
+    """(n,) True for samples that lie on the straight line through their neighbours, in time too, two or more in a row.
+
+    A single one may: rounded positions meet it by chance.
+    """
+    velocities = np.diff(track.positions, axis=0) / np.diff(track.times)[:, None]
+    spans = 0.5 * (track.times[2:] - track.times[:-2])
+    even = np.zeros(len(track) + 2, dtype=bool)
+    even[2:-2] = (np.abs(np.diff(velocities, axis=0)) < EVENLY * spans[:, None]).all(axis=1)
+    return np.asarray(even[1:-1] & (even[:-2] | even[2:]))
 
 
 @lru_cache(maxsize=16)

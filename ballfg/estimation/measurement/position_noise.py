@@ -120,7 +120,7 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
         return ()
     remedy = "State position_noise (ballfg noise finds it)." if track.sigmas is None else "State larger ones."
     return (
-        f"the positions scatter by {1e3 * seen:.2g} mm where their noise is stated as {1e3 * said:.2g} mm: sigmas are "
+        f"the positions scatter by {1e3 * seen:.2g} mm where the settings say {1e3 * said:.2g} mm: sigmas are "
         f"too small, and good samples may be set aside. {remedy}",
     )
 

@@ -158,6 +158,27 @@ def test_positions_that_a_tracker_holds_for_a_stamp_show() -> None:
     assert not any(said.values())
 
 
+def test_gaps_that_someone_filled_show() -> None:
+    """A line across a gap is no measurement; a measured flight, a rest and a single sample are silent."""
+    whole = _thrown(np.random.default_rng(3))
+
+    def without(first: int, last: int) -> Track:
+        gone = np.arange(first, last)
+        known = np.delete(np.arange(len(whole)), gone)
+        lines = [np.interp(whole.times, whole.times[known], axis[known]) for axis in whole.positions.T]
+        return replace(whole, positions=np.stack(lines, axis=1))
+
+    lies = Track(np.arange(100) / 100, np.tile([0.5, 0.0, 0.78], (100, 1)), name="lies")
+    cases = {"whole": [whole], "lies": [whole, lies], "filled": [without(12, 20)], "one": [without(12, 13)]}
+    said = {}
+    for name, tracks in cases.items():
+        found = in_flight(dataset_in_memory(INFO, tracks))
+        said[name] = [line for line in found.lines if "gaps were filled in" in line]
+    (line,) = said.pop("filled")
+    assert line.startswith(f"{100 * 8 / len(whole):.0f} % of the positions in flight lie on straight lines")
+    assert not any(said.values())
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Four recordings, mostly held."""

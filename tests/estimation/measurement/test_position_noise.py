@@ -38,7 +38,7 @@ def test_scatter_beyond_the_stated_noise_is_told(share, told, own):
     notes = noise_doubts(track, Settings() if own else Settings(position_noise=stated))
     assert bool(notes) == told
     if told:
-        assert f"where their noise is stated as {1e3 * share * np.sqrt((SIGMA**2).mean()):.2g} mm" in notes[0]
+        assert f"where the settings say {1e3 * share * np.sqrt((SIGMA**2).mean()):.2g} mm" in notes[0]
 
 
 @pytest.mark.parametrize(("share", "told"), [(1.0, False), (0.3, True)])
