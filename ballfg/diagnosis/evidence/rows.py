@@ -118,13 +118,8 @@ class Rows:
 
     def mixed(self, other: "Rows", chosen: Mask) -> "Rows":
         """The rows with those of chosen stretches (b,) about another path."""
-        return replace(
-            self,
-            residual=mixed_arrays(self.residual, other.residual, chosen),
-            by_start=mixed_arrays(self.by_start, other.by_start, chosen),
-            by_common=mixed_arrays(self.by_common, other.by_common, chosen),
-            random=mixed_arrays(self.random, other.random, chosen),
-        )
+        names = ("residual", "by_start", "by_common", "random")
+        return replace(self, **{n: mixed_arrays(getattr(self, n), getattr(other, n), chosen) for n in names})
 
     def beside(self, columns: Array) -> "Rows":
         """The rows with further common unknowns, last; columns: (b, m, p)."""

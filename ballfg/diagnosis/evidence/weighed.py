@@ -29,8 +29,8 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
 HARDLY_MOVED = 0.1  # Largest change of such a difference, over its unit, that paths need not follow
-MOST_STEPS = 12  # Largest number of steps from a deterministic fit to the most probable unknowns
-MOST_DAMPED = 3  # Largest number of tries of one step, each damped more
+MOST_STEPS = 16  # Largest number of steps from a deterministic fit to the most probable unknowns
+MOST_DAMPED = 4  # Largest number of tries of one step, each damped more
 WORTH_A_STEP = 0.5  # Least gain of a step, natural units
 
 
@@ -133,31 +133,27 @@ def weighed(
     halves: Mask,
     like: Weighed | None = None,
     patterns: Patterns | None = None,
-    smaller: Weighed | None = None,
-    least: float = -np.inf,
 ) -> Weighed:
     """Weighs a model at the most probable values of its unknowns.
 
     A deterministic fit ends where the model alone comes closest to the samples; beside random motion other values are
     more probable. From the fit on, the common unknowns follow the likelihood. First states and random motion are
-    integrated out about paths of the model: about others, whose distance the motion would bridge, flights and bounces
-    are far from linear.
+    integrated out about the path that comes closest to the samples: about another one, whose distance the motion would
+    bridge, flights and bounces are far from linear.
 
     Args: fit: to the tracks of both halves.  motion: random columns of this or a similar model.  halves: (t,) in the
         order of the fit's tracks (`unlike_halves`).  like: a similar model.  patterns: of this or a similar model.
-        smaller: one with a part of its effects; None: `like`, where it is that.  least: score below which the result
-        does not matter, so that steps end where they do not promise it.
     """
     with np.errstate(invalid="ignore"):  # differences of models without a density: they lose to all others
         question = _Question(named, motion, halves, patterns)
-        point, (found, ahead, density) = question.begun(fit, like, smaller or like)
+        point, (found, ahead, density) = question.begun(fit, like)
         if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
             return question.at(point.begun_at((found.start,)), found.widths)[0]
         way, other, failed = question.turned, question.moved, 0
         for _ in range(MOST_STEPS):
             after = way(point, found, ahead, density)
             failed = 0 if after else failed + 1
-            if failed == 2 or found.score + ahead.gain < least:
+            if failed == 2:
                 break
             if after:
                 point, (found, ahead, density) = after
@@ -247,30 +243,29 @@ class _Question:
             if np.isfinite(moved.cost):
                 followed_by = followed(point.fit, replace(unknowns, own=own))
                 after = self._closer(self.point(moved, [model.start]), followed_by, model)
-                share = (self._density(after, model.widths) - before) / promised
-                if share > HARDLY:
-                    found = self.at(after, damping=next_damping(damping, share))
-                    if found[2] > before + WORTH_A_STEP:
-                        return after, found
+                gain = self._density(after, model.widths) - before
+                share = gain / promised
+                if share > HARDLY and gain > WORTH_A_STEP:
+                    return after, self.at(after, damping=next_damping(damping, share))
             damping = max(FIRST_DAMPING, DAMPED * damping)
         return None
 
-    def begun(self, fit: Fit, like: Weighed | None, smaller: Weighed | None = None) -> tuple[Point, _At]:
+    def begun(self, fit: Fit, like: Weighed | None) -> tuple[Point, _At]:
         """The most probable of the beginnings: tracks that are all alike, and what they have of their own by another.
 
-        Where this model is a smaller one with further effects, that is one where they are absent: it is as probable as
-        the smaller one, and steps lead on from there.
+        Where this model is the other one with further effects, that is one where they are absent: it is as probable as
+        the other, and steps lead on from there.
 
-        Args: like: the other, similar model.  smaller: one with a part of its effects, if it is that.
+        Args: like: the other, similar model.
         """
         own = {} if like is None else carried_over(like.fit, like.named, fit, self.named)
         starts = [None] if like is None else [like.start] if own else [like.start, None]
         points = [self.point(self._about(fit, own), starts)]
         if own:
             points.append(self.point(self._about(fit, {}), [None]))
-        beside = None if smaller is None else with_absent(smaller.fit, smaller.named, fit, self.named)
-        if smaller is not None and beside is not None:
-            points.append(self.point(beside, [smaller.start]))
+        beside = None if like is None else with_absent(like.fit, like.named, fit, self.named)
+        if beside is not None:
+            points.append(self.point(beside, [like.start]))
         found = [(point, self.at(point)) for point in points]
         return max(found, key=lambda one: one[1][0].evidence)
 
@@ -294,8 +289,7 @@ class _Question:
         They come closest to the samples with what each stretch most probably has of its own; where that is beyond the
         linear range, it may be less probable.
         """
-        reaches: Mask = np.asarray(np.isfinite(fit.predicted.positions).all(axis=(1, 2)))
-        fit = mixed(point.fit, fit, reaches)
+        fit = mixed(point.fit, fit, np.isfinite(fit.predicted.positions).all(axis=(1, 2)))
         other = self.point(fit, [model.start])
         return point.mixed(other, other.densities > point.densities).begun_at([model.start])
 

@@ -84,12 +84,8 @@ class System:
 
     def mixed(self, other: "System", chosen: Mask) -> "System":
         """The system with the rows of chosen stretches (n,) about another path."""
-        return replace(
-            self,
-            residual=mixed_arrays(self.residual, other.residual, chosen),
-            by_start=mixed_arrays(self.by_start, other.by_start, chosen),
-            by_common=mixed_arrays(self.by_common, other.by_common, chosen),
-        )
+        names = ("residual", "by_start", "by_common")
+        return replace(self, **{n: mixed_arrays(getattr(self, n), getattr(other, n), chosen) for n in names})
 
     def start_correction(self, residual: Array) -> Array:
         """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""

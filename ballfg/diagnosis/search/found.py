@@ -143,7 +143,7 @@ class Found(WeighedModels):
                 continue
             tell(f"fitting with {other.name} in place of {gone}")
             candidate = next(s for s in scored if s.hypothesis is other)
-            asked = best, own, candidate, self.first, self.motion, self.halves, self.within(names)
+            asked = best, own, candidate, self.first, self.motion, self.halves
             tasks[names] = [partial(way, *asked) for way in (_in_place, _first_beside)]
         made = do_all([task for ways in tasks.values() for task in ways], self.jobs)
         winner = self.most_probable(self.known([found for _, found in made if found is not None]))
@@ -261,29 +261,17 @@ def _weighed_refit(
 
 
 def _in_place(
-    best: Weighed,
-    gone: Hypothesis,
-    candidate: Scored,
-    first: Fit,
-    motion: Motion,
-    halves: Mask,
-    smaller: Weighed | None,
+    best: Weighed, gone: Hypothesis, candidate: Scored, first: Fit, motion: Motion, halves: Mask
 ) -> tuple[Refit, Weighed]:
     """The refit without an effect and with a candidate in its place, and how probable it is."""
     refitted = refit(smaller_fit(best, [gone], first), candidate)
     named = (*(h for h in best.named if h.name != gone.name), candidate.hypothesis)
-    return refitted, weighed(refitted.fit, named, motion, halves, best, smaller=smaller)
+    return refitted, weighed(refitted.fit, named, motion, halves, best)
 
 
 def _first_beside(
-    best: Weighed,
-    gone: Hypothesis,
-    candidate: Scored,
-    first: Fit,
-    motion: Motion,
-    halves: Mask,
-    smaller: Weighed | None,
+    best: Weighed, gone: Hypothesis, candidate: Scored, first: Fit, motion: Motion, halves: Mask
 ) -> tuple[Refit, Weighed | None]:
     """The same by way of the refit with both; either way may lead into a poor minimum."""
     refitted, both = _weighed_refit(partial(refit, best.fit, candidate), best, motion, halves)
-    return refitted, None if both is None else weighed_without(both, [gone], first, motion, halves, smaller)
+    return refitted, None if both is None else weighed_without(both, [gone], first, motion, halves)

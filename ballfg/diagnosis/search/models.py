@@ -120,11 +120,6 @@ class WeighedModels:
             self.models[names] = weighed(model.fit, model.named, self.motion, self.halves, model)
         return self.models[names]
 
-    def within(self, names: frozenset[str]) -> Weighed | None:
-        """The most probable model so far with a part of some effects; None without any."""
-        smaller = [m for known, m in self.models.items() if known < names and NAMELESS not in known]
-        return max(smaller, key=SCORE, default=None)
-
     def without(self, gone: Sequence[Hypothesis], model: Weighed | None = None) -> Weighed:
         """A model without some of its effects, and without those that need them."""
         return self.without_each([gone], model or self.best)[0]
@@ -141,8 +136,7 @@ class WeighedModels:
             poor = before and foretold and before.score < foretold.score - WORTH_A_STEP
             if before is None or (poor and (model.names, names) not in self.tried):
                 self.tried.add((model.names, names))
-                alike = model, gone, self.first, self.motion, self.halves
-                tasks[names] = partial(weighed_without, *alike, self.within(names))
+                tasks[names] = partial(weighed_without, model, gone, self.first, self.motion, self.halves)
         self.known(do_all(list(tasks.values()), self.jobs))
         return [self.models[names] for names in asked]
 
@@ -238,27 +232,20 @@ def smaller_fit(model: Weighed, gone: Sequence[Hypothesis], first: Fit) -> Fit:
     return without_named(model.alike, gone, first)
 
 
-def weighed_without(
-    model: Weighed,
-    gone: Sequence[Hypothesis],
-    first: Fit,
-    motion: Motion,
-    halves: Mask,
-    smaller: Weighed | None = None,
-) -> Weighed:
+def weighed_without(model: Weighed, gone: Sequence[Hypothesis], first: Fit, motion: Motion, halves: Mask) -> Weighed:
     """A model without some of its effects, from where `smaller_fit` leads.  Args: as of `smaller_fit`, `weighed`.
 
     Where that is a poorer minimum than the linearisation foretells, steps of the fit may lead to a better one.
     """
     kept = [h for h in model.named if h not in gone]
-    found = weighed(smaller_fit(model, gone, first), kept, motion, halves, model, smaller=smaller)
+    found = weighed(smaller_fit(model, gone, first), kept, motion, halves, model)
     foretold = model.nested.get(model.names - {h.name for h in gone})
     if foretold is None or found.score > foretold.score - WORTH_A_STEP:
         return found
     other = without_named(model.alike, gone, first)
     if not np.isfinite(other.cost):
         return found
-    return max(found, weighed(other, kept, motion, halves, model, least=found.score), key=lambda one: one.score)
+    return max(found, weighed(other, kept, motion, halves, model), key=lambda one: one.score)
 
 
 def without_named(fit: Fit, gone: Sequence[Hypothesis], first: Fit) -> Fit:
