@@ -1,7 +1,6 @@
 """Finds what tracks have of their own: what their coefficients and the air differ by from those of all tracks."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -41,19 +40,3 @@ def carried_over(
     for name in own.keys() & moved:
         own[name] = own[name] + before.get(name, 0.0) - after.get(name, 0.0)
     return own
-
-
-def with_absent(fit: Fit, named: Sequence[Hypothesis], other: Fit, other_named: Sequence[Hypothesis]) -> Fit | None:
-    """The unknowns of a fit in the problem of another one, whose further effects are absent.
-
-    None if that one has not all of its effects, or one that comes in no sizes.
-    """
-    further = [h for h in other_named if h not in named]
-    if not all(h in other_named for h in named) or not further or not all(h.strengths for h in further):
-        return None
-    problem, parameters = other.problem, dict(other.problem.model.named_parameters())
-    absent = {c: float(parameters[c]) if c in parameters else 0.0 for h in further for c in h.columns}
-    known = {name: value for name, value in fit.unknowns.values.items() if name in problem.free}
-    values = {**other.unknowns.values, **absent, **known}
-    same = replace(problem, stretches=fit.problem.stretches)
-    return Fit.at(same, replace(fit.unknowns, values=values), other.noise)

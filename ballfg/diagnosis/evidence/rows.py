@@ -20,7 +20,6 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import free_motion
 from ballfg.diagnosis.fit.scatter import by_own
 from ballfg.diagnosis.fit.stretches import batches_of, of_similar_length
-from ballfg.diagnosis.fit.system import mixed_arrays
 from ballfg.state import SPIN, STATE_DIM
 
 ACCELERATIONS, VELOCITIES, SPINS, COEFFICIENTS = range(4)
@@ -116,11 +115,6 @@ class Rows:
             found[stretches] = rows.swapaxes(1, 2) @ rows
         return found
 
-    def mixed(self, other: "Rows", chosen: Mask) -> "Rows":
-        """The rows with those of chosen stretches (b,) about another path."""
-        names = ("residual", "by_start", "by_common", "random")
-        return replace(self, **{n: mixed_arrays(getattr(self, n), getattr(other, n), chosen) for n in names})
-
     def beside(self, columns: Array) -> "Rows":
         """The rows with further common unknowns, last; columns: (b, m, p)."""
         return replace(self, by_common=np.concatenate((self.by_common, columns), axis=-1))
@@ -128,10 +122,10 @@ class Rows:
 
 def rows_of(fit: Fit, motion: Motion) -> list[Rows]:
     """The rows of a fit at its minimum; motion: `random_motion` of this or a similar fit to the same samples."""
-    stretches, root = fit.problem.stretches, roots(fit)
-    by_coefficient = by_own(fit, list(motion.spread)) * motion.units / root
-    used, system = stretches.used.numpy(), fit.linearised
+    system, stretches, root = fit.linearised, fit.problem.stretches, roots(fit)
+    used = stretches.used.numpy()
     residual, by_start, by_common = system.residual / root[..., 0], system.by_start / root, system.by_common / root
+    by_coefficient = by_own(fit, list(motion.spread)) * motion.units / root
     own = np.zeros((len(used), len(motion.spread)))
     for place, name in enumerate(motion.spread):
         own[:, place] = fit.unknowns.own.get(name, 0.0)

@@ -10,28 +10,29 @@ import numpy as np
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.evidence.halves import unlike_halves
 from ballfg.diagnosis.evidence.likelihood import Batches, Noise, Reduced, Weights, held_out, posterior
-from ballfg.diagnosis.evidence.own import carried_over, most_probable, with_absent
-from ballfg.diagnosis.evidence.point import Point
+from ballfg.diagnosis.evidence.own import carried_over, most_probable
 from ballfg.diagnosis.evidence.prior import WIDTHS, Priors, choice_odds, log_odds, within
-from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, random_motion, rows_beside, scattering
+from ballfg.diagnosis.evidence.rows import NAMELESS, Motion, Patterns, Rows, random_motion, rows_beside, scattering
 from ballfg.diagnosis.evidence.sizes import (
     DAMPED,
     FIRST_DAMPING,
     HARDLY,
     Ahead,
+    Sized,
     Start,
+    begun,
     climbed,
     next_damping,
 )
-from ballfg.diagnosis.fit.fit import alike, followed, mixed, responded, with_guesses
+from ballfg.diagnosis.fit.fit import alike, followed, with_guesses
 from ballfg.diagnosis.fit.free import OWN_AIR
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 
+MOST_TURNS = 4  # Largest number of times that paths follow what the coefficients of each stretch differ by
 HARDLY_MOVED = 0.1  # Largest change of such a difference, over its unit, that paths need not follow
-MOST_STEPS = 16  # Largest number of steps from a deterministic fit to the most probable unknowns
-MOST_DAMPED = 4  # Largest number of tries of one step, each damped more
-WORTH_A_STEP = 0.5  # Least gain of a step, natural units
+MOST_STEPS = 12  # Largest number of steps from a deterministic fit to the most probable unknowns
+WORTH_A_STEP = 0.5  # Least expected gain of a step, natural units
 
 
 @dataclass(frozen=True)
@@ -149,17 +150,40 @@ def weighed(
         point, (found, ahead, density) = question.begun(fit, like)
         if question.nameless:  # without patterns the path would leave the samples; noise and widths need a second turn
             return question.at(point.begun_at((found.start,)), found.widths)[0]
-        way, other, failed = question.turned, question.moved, 0
-        for _ in range(MOST_STEPS):
-            after = way(point, found, ahead, density)
-            failed = 0 if after else failed + 1
-            if failed == 2:
+        for _ in range(MOST_TURNS):
+            turned = question.turned(point, found)
+            if turned is None:
                 break
-            if after:
-                point, (found, ahead, density) = after
-            if not after or way == question.turned:  # steps follow a turn, since they turn too
-                way, other = other, way
+            point, (found, ahead, density) = turned
+        for _ in range(MOST_STEPS):
+            moved = question.moved(point, found, ahead, density)
+            if moved is None:
+                break
+            point, damping = moved
+            found, ahead, density = question.at(point, damping=damping)
         return found.without(ahead.gain) if ahead.gain > WORTH_A_STEP else found
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A fit with its rows, beside patterns without a name if the question has them, and the priors there.
+
+    Its noise is sought from the sizes with which the starts, as of `settled`, begin.
+    """
+
+    fit: Fit
+    rows: Sequence[Rows]
+    priors: Priors
+    starts: Sequence[Sized] = ()
+
+    def begun_at(self, starts: Sequence[Start | None]) -> "_Point":
+        """The point with these starts."""
+        return replace(self, starts=[begun(self.rows, start) for start in starts])
+
+    @property
+    def own(self) -> int:
+        """Number of the common unknowns that the fit has; those of patterns come after them."""
+        return len(self.fit.problem.common_precision)
 
 
 _At = tuple[Weighed, Ahead, float]
@@ -179,12 +203,12 @@ class _Question:
         """Whether there are patterns without a name."""
         return self.patterns is not None
 
-    def point(self, fit: Fit, starts: Sequence[Start | None]) -> Point:
+    def point(self, fit: Fit, starts: Sequence[Start | None]) -> _Point:
         fit = with_guesses(fit)
         rows = rows_beside(fit, self.motion, self.patterns)
-        return Point(fit, rows, Priors.of(fit, self.named, self.patterns)).begun_at(starts)
+        return _Point(fit, rows, Priors.of(fit, self.named, self.patterns)).begun_at(starts)
 
-    def at(self, point: Point, widths: Sequence[int] = (), damping: float = 0.0) -> _At:
+    def at(self, point: _Point, widths: Sequence[int] = (), damping: float = 0.0) -> _At:
         """The model at the unknowns of a point, the way to more probable ones, and the density as in `_density`.
 
         Args: widths: of the effects, then of the patterns, of a similar model.  damping: of the next step.
@@ -225,8 +249,8 @@ class _Question:
         )
         return weighed, replace(Ahead.of(fit, result), damping=damping), result.held(own).evidence
 
-    def moved(self, point: Point, model: Weighed, ahead: Ahead, before: float) -> tuple[Point, _At] | None:
-        """The model after a step to more probable common unknowns; None if none is worth it.
+    def moved(self, point: _Point, model: Weighed, ahead: Ahead, before: float) -> tuple[_Point, float] | None:
+        """The point after a step to more probable unknowns, and the damping of the next; None if none is worth it.
 
         A step may leave the linear range: where samples cannot tell a clock from gravity, say, or hardly show spins.
         Damped, it stays among what they show well.
@@ -234,27 +258,20 @@ class _Question:
         Args: before: the density at the point.
         """
         damping = ahead.damping
-        for _ in range(MOST_DAMPED):
+        while True:
             step, promised = ahead.step(damping)
             if promised < WORTH_A_STEP:
-                break
-            unknowns = point.fit.stepped(step)
-            moved, own = responded(point.fit, unknowns), self._own(point, model, step)
-            if np.isfinite(moved.cost):
-                followed_by = followed(point.fit, replace(unknowns, own=own))
-                after = self._closer(self.point(moved, [model.start]), followed_by, model)
-                gain = self._density(after, model.widths) - before
-                share = gain / promised
-                if share > HARDLY and gain > WORTH_A_STEP:
-                    return after, self.at(after, damping=next_damping(damping, share))
+                return None
+            fit = followed(point.fit, replace(point.fit.stepped(step), own=self._own(point, model, step)))
+            after = self.point(fit, (model.start,)) if np.isfinite(fit.cost) else None
+            density = -np.inf if after is None else self._density(after, model.widths)
+            share = (density - before) / promised
+            if after is not None and share > HARDLY:
+                return after, next_damping(damping, share)
             damping = max(FIRST_DAMPING, DAMPED * damping)
-        return None
 
-    def begun(self, fit: Fit, like: Weighed | None) -> tuple[Point, _At]:
-        """The most probable of the beginnings: tracks that are all alike, and what they have of their own by another.
-
-        Where this model is the other one with further effects, that is one where they are absent: it is as probable as
-        the other, and steps lead on from there.
+    def begun(self, fit: Fit, like: Weighed | None) -> tuple[_Point, _At]:
+        """The more probable of two beginnings: tracks that are all alike, and what they have of their own by another.
 
         Args: like: the other, similar model.
         """
@@ -263,35 +280,29 @@ class _Question:
         points = [self.point(self._about(fit, own), starts)]
         if own:
             points.append(self.point(self._about(fit, {}), [None]))
-        beside = None if like is None else with_absent(like.fit, like.named, fit, self.named)
-        if beside is not None:
-            points.append(self.point(beside, [like.start]))
         found = [(point, self.at(point)) for point in points]
         return max(found, key=lambda one: one[1][0].evidence)
 
-    def turned(self, point: Point, model: Weighed, ahead: Ahead, before: float) -> tuple[Point, _At] | None:
-        """The model about the paths with what coefficients of each stretch most probably differ by; None as `moved`."""
-        known, own = point.fit.unknowns.own, self._own(point, model, np.zeros(point.own))
-        away = [np.abs(own[name] - known.get(name, 0.0)).max() / unit for name, unit in self.motion.spread.items()]
+    def turned(self, point: _Point, model: Weighed) -> tuple[_Point, _At] | None:
+        """A more probable model, about the paths with what coefficients of each stretch most probably differ by.
+
+        Half of the way leads to one where the whole leaves the linear range; None if neither does.
+        """
+        before = point.fit.unknowns.own
+        moves = {n: value - before.get(n, 0.0) for n, value in self._own(point, model, np.zeros(point.own)).items()}
+        away = [np.abs(moves[name]).max() / unit for name, unit in self.motion.spread.items()]
         if max(away, default=0.0) < HARDLY_MOVED:
             return None
-        turned = followed(point.fit, replace(point.fit.unknowns, own=own))
-        after = self._closer(point.begun_at([model.start]), turned, model)
-        found = self.at(after, damping=ahead.damping)
-        return (after, found) if found[2] > before + WORTH_A_STEP else None
+        for share in (1.0, 0.5):
+            fit = self._about(point.fit, {name: before.get(name, 0.0) + share * move for name, move in moves.items()})
+            after = self.point(fit, [model.start])
+            found = self.at(after)
+            if found[0].evidence > model.evidence:
+                return after, found
+        return None
 
-    def _own(self, point: Point, model: Weighed, step: Array) -> dict[str, Array]:
+    def _own(self, point: _Point, model: Weighed, step: Array) -> dict[str, Array]:
         return most_probable(point.fit, Batches.of(point.rows, model.weights), model.noise, self.motion, step)
-
-    def _closer(self, point: Point, fit: Fit, model: Weighed) -> Point:
-        """The point with those paths of a fit about which a stretch is more probable, at the same common unknowns.
-
-        They come closest to the samples with what each stretch most probably has of its own; where that is beyond the
-        linear range, it may be less probable.
-        """
-        fit = mixed(point.fit, fit, np.isfinite(fit.predicted.positions).all(axis=(1, 2)))
-        other = self.point(fit, [model.start])
-        return point.mixed(other, other.densities > point.densities).begun_at([model.start])
 
     @staticmethod
     def _about(fit: Fit, own: Mapping[str, Array]) -> Fit:
@@ -299,7 +310,7 @@ class _Question:
         closest = followed(fit, replace(fit.unknowns, own=own))
         return closest if np.isfinite(closest.cost) else fit
 
-    def _density(self, point: Point, widths: Sequence[int]) -> float:
+    def _density(self, point: _Point, widths: Sequence[int]) -> float:
         """Logarithm of the density at the unknowns of a point, up to a constant, where its noise begins.
 
         The evidence is what it would be at the end of the step from there, if that were linear.

@@ -16,7 +16,7 @@ from ballfg.diagnosis.fit.free import Unknowns, declared_deviations, declared_fr
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, scatter_axes
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
-from ballfg.diagnosis.fit.system import System, mixed_arrays
+from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.result import Value
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings
@@ -104,33 +104,20 @@ def followed(fit: Fit, unknowns: Unknowns) -> Fit:
 
     Its cost is infinite if a path misses a contact.  Args: unknowns: their first states are not used.
     """
-    names, system, before = fit.problem.free, fit.linearised, fit.unknowns.own
-    expected, none = system.residual - _step_of(fit, unknowns), np.zeros(len(fit.unknowns.starts))
+    names, system = fit.problem.free, fit.linearised
+    values = np.array([unknowns.values[name] - fit.unknowns.values[name] for name in names])
+    step = np.concatenate((values, (unknowns.launcher - fit.unknowns.launcher).ravel()))
+    expected = system.residual - system.by_common @ step
+    none = np.zeros(len(fit.unknowns.starts))
     for place, name in enumerate(names):
-        if name in unknowns.own or name in before:
-            moved_own = unknowns.own.get(name, none) - before.get(name, none)
+        if name in unknowns.own or name in fit.unknowns.own:
+            moved_own = unknowns.own.get(name, none) - fit.unknowns.own.get(name, none)
             expected = expected - system.by_common[..., place] * moved_own[:, None]
     starts = fit.unknowns.starts + system.start_correction(expected)
     moved = Fit.at(fit.problem, replace(unknowns, starts=starts), fit.noise)
     for _ in range(CORRECTIONS):
         moved = _followed_up(moved, system, fit.robust)
     return moved
-
-
-def responded(fit: Fit, unknowns: Unknowns) -> Fit:
-    """The fit at other common unknowns, its first states those whose paths stay where they were, as far as they can.
-
-    What stretches have of their own stays.  Args: unknowns: their first states are not used.
-    """
-    starts = fit.unknowns.starts + fit.linearised.start_correction(-_step_of(fit, unknowns))
-    return Fit.at(fit.problem, replace(unknowns, starts=starts, own=fit.unknowns.own), fit.noise)
-
-
-def _step_of(fit: Fit, unknowns: Unknowns) -> Array:
-    """(n, m) by how much the rows of a fit move with a step to other common unknowns."""
-    values = np.array([unknowns.values[name] - fit.unknowns.values[name] for name in fit.problem.free])
-    step = np.concatenate((values, (unknowns.launcher - fit.unknowns.launcher).ravel()))
-    return np.asarray(fit.linearised.by_common @ step)
 
 
 def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> dict[str, Value]:
@@ -214,25 +201,14 @@ def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
     unknowns = replace(moved.unknowns, starts=moved.unknowns.starts + correction)
     closer = Fit.at(moved.problem, unknowns, moved.noise)
     gains = closer.robust.losses < moved.robust.losses
-    return mixed(moved, closer, gains)
-
-
-def mixed(fit: Fit, other: Fit, chosen: Mask) -> Fit:
-    """The fit with the states, and what else stretches have of their own, of another one for chosen stretches (n,).
-
-    Both have the same common unknowns.
-    """
-
-    def of(one: Array, two: Array) -> Array:
-        return mixed_arrays(one, two, chosen)
-
-    unknowns, others, none = fit.unknowns, other.unknowns, np.zeros(len(chosen))
-    names = dict.fromkeys([*unknowns.own, *others.own])
-    own = {name: of(unknowns.own.get(name, none), others.own.get(name, none)) for name in names}
-    one, two = fit.predicted, other.predicted
-    predicted = Predicted(of(one.positions, two.positions), of(one.labels, two.labels), of(one.contacts, two.contacts))
-    unknowns = replace(unknowns, starts=of(unknowns.starts, others.starts), own=own)
-    return replace(fit, unknowns=unknowns, predicted=predicted)
+    starts = np.where(gains[:, None], unknowns.starts, moved.unknowns.starts)
+    one, other = closer.predicted, moved.predicted
+    predicted = Predicted(
+        np.where(gains[:, None, None], one.positions, other.positions),
+        np.where(gains[:, None], one.labels, other.labels),
+        np.where(gains[:, None], one.contacts, other.contacts),
+    )
+    return replace(moved, unknowns=replace(unknowns, starts=starts), predicted=predicted)
 
 
 def _settled(result: Fit) -> Noise:

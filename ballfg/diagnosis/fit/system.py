@@ -3,7 +3,7 @@
 The best first state absorbs a part of each common column; tests and fits need only the inner products of the rest.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -82,19 +82,9 @@ class System:
             left.append((batch.numbers, rows[..., STATE_DIM:end]))
         return Eliminated(solved, tuple(left))
 
-    def mixed(self, other: "System", chosen: Mask) -> "System":
-        """The system with the rows of chosen stretches (n,) about another path."""
-        names = ("residual", "by_start", "by_common")
-        return replace(self, **{n: mixed_arrays(getattr(self, n), getattr(other, n), chosen) for n in names})
-
     def start_correction(self, residual: Array) -> Array:
         """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""
         return System(residual, self.by_start, self.by_common[..., :0], self.used).eliminated().solved[..., 0]
-
-
-def mixed_arrays(one: Array, other: Array, chosen: Mask) -> Array:
-    """One array (n, ...) with the rows of another for chosen ones (n,)."""
-    return np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), other, one)
 
 
 def bounded_step(hessian: Array, gradient: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
