@@ -122,10 +122,10 @@ class Rows:
 
 def rows_of(fit: Fit, motion: Motion) -> list[Rows]:
     """The rows of a fit at its minimum; motion: `random_motion` of this or a similar fit to the same samples."""
-    system, stretches, root = fit.linearised, fit.problem.stretches, roots(fit)
-    used = stretches.used.numpy()
-    residual, by_start, by_common = system.residual / root[..., 0], system.by_start / root, system.by_common / root
+    stretches, root = fit.problem.stretches, roots(fit)
     by_coefficient = by_own(fit, list(motion.spread)) * motion.units / root
+    used, system = stretches.used.numpy(), fit.linearised
+    residual, by_start, by_common = system.residual / root[..., 0], system.by_start / root, system.by_common / root
     own = np.zeros((len(used), len(motion.spread)))
     for place, name in enumerate(motion.spread):
         own[:, place] = fit.unknowns.own.get(name, 0.0)

@@ -1,6 +1,6 @@
 """Defines a fit problem with its unknowns, priors and losses, and linearises its rows."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Self
@@ -222,8 +222,13 @@ class Fit:
         scale = np.sqrt(self.robust.samples[stretches])[..., None] / self.sigmas[stretches]
         return np.asarray((derivative * scale[..., None]).reshape(len(derivative), -1, derivative.shape[-1]))
 
-    def sensitivity(self) -> Sensitivity:
-        """Derivatives of the samples by first states and by all of `Problem.free`.
+    @cached_property
+    def in_own_air(self) -> Sensitivity:
+        """As `sensitivity`, and last by a wind of each stretch where none is free: `linearised` then needs no other."""
+        return self.sensitivity([name for name in OWN_AIR if name not in self.problem.free])
+
+    def sensitivity(self, further: Sequence[str] = ()) -> Sensitivity:
+        """Derivatives of the samples by first states, by all of `Problem.free`, and by further coefficients.
 
         The derivative by a deviation is that by its coefficient, times the weight of each stretch.
         """
@@ -233,13 +238,13 @@ class Fit:
             none = [(0, 0)] * (found.labels.ndim - 1) + [(0, len(problem.free))]
             return Sensitivity(np.pad(found.positions, [(0, 0), *none]), np.pad(found.labels, none))
         behind = [deviations[name].coefficient if name in deviations else name for name in problem.free]
-        names = list(dict.fromkeys(behind))
-        parameters = dict(problem.model.named_parameters())
+        names, model = list(dict.fromkeys([*behind, *further])), problem.in_own_air if further else self.model
+        parameters = dict(model.named_parameters())
         known = {name: float(parameters[name].detach()) for name in names} | self.values
-        found = sensitivity(self.model, problem.stretches, self.unknowns.starts, known, names)
+        found = sensitivity(model, problem.stretches, self.unknowns.starts, known, names)
         if not deviations:
             return found
-        chosen = [*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in behind)]
+        chosen = [*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in (*behind, *further))]
         weights = np.ones((len(problem.stretches), len(chosen)))
         for place, name in enumerate(problem.free, start=STATE_DIM):
             if name in deviations:
@@ -271,7 +276,8 @@ class Fit:
     def linearised(self) -> System:
         """The whitened, robustly weighted rows; common columns are coefficients, then launcher settings."""
         stretches, unknowns, noise = self.problem.stretches, self.unknowns, self.noise
-        derivative = self.sensitivity()
+        derivative = self.__dict__.get("in_own_air") or self.sensitivity()
+        derivative = derivative.first(STATE_DIM + len(self.problem.free))
         positions, labelled = self.position_rows(derivative.positions), stretches.labelled[:, None, None]
         spins, scale = np.zeros((len(stretches), 3, derivative.labels.shape[-1])), noise.spin[:, None]
         axes = scatter_axes(unknowns.starts)

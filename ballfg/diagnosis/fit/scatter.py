@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.fit.free import OWN_AIR
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.sensitivity import sensitivity
 from ballfg.state import STATE_DIM
 
 
@@ -15,15 +15,14 @@ def by_own(fit: Fit, names: Sequence[str]) -> Array:
 
     Args: names: c parameters, free ones of the fit or those of a wind.
     """
-    problem, system, free = fit.problem, fit.linearised, list(fit.problem.free)
-    further = [name for name in names if name not in free]
-    columns = np.zeros((*system.by_common.shape[:2], len(names)))
-    if further:
-        parameters = dict(problem.in_own_air.named_parameters())
-        known = {name: float(parameters[name]) for name in further} | fit.values
-        found = sensitivity(problem.in_own_air, problem.stretches, fit.unknowns.starts, known, further)
-        columns[:, :-3, [name in further for name in names]] = fit.position_rows(found.positions[..., STATE_DIM:])
+    free = list(fit.problem.free)
+    air = [name for name in OWN_AIR if name not in free]
+    by_air = fit.in_own_air.positions[..., STATE_DIM + len(free) :] if set(names) & set(air) else None
+    by_common = fit.linearised.by_common
+    columns = np.zeros((*by_common.shape[:2], len(names)))
     for place, name in enumerate(names):
         if name in free:
-            columns[..., place] = system.by_common[..., free.index(name)]
+            columns[..., place] = by_common[..., free.index(name)]
+        elif by_air is not None:
+            columns[:, :-3, place] = fit.position_rows(by_air[..., [air.index(name)]])[..., 0]
     return columns

@@ -45,6 +45,10 @@ class Sensitivity:
     positions: Array
     labels: Array
 
+    def first(self, count: int) -> "Sensitivity":
+        """Those by the first directions."""
+        return Sensitivity(self.positions[..., :count], self.labels[..., :count])
+
 
 def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float | Array]) -> Predicted:
     """The samples of a model, from states (n, 9) at the first samples.
