@@ -29,8 +29,17 @@ UNDISTURBED: Final = 0.2  # Quantile of that ratio: stretches with a bounce or a
 SMOOTHING: Final = "a filter smoothed the positions"
 OTHER: Final = "of another ball, or outliers"
 REPEATED: Final = "a tracker held or rounded them"
+REPEATS: Final = (
+    f"repeat the one before them: {REPEATED}; leave the repeats out, or velocities lag and sigmas are too small"
+)
 FILLED: Final = "gaps were filled in"
-FILLS: Final = 0.01  # Share of the samples in flight from which filled ones are worth a doubt: measured ones never show
+LINES: Final = (
+    f"lie on straight lines, at even speed: {FILLED}; leave those samples out, or the ball seems to fly straight on "
+    "there and sigmas are too small"
+)
+FILLS: Final = 0.01
+"""Share of the samples in flight from which filled ones are worth a doubt. No set chose it: `spindoe`, rounded to mm,
+has 0.08 %, `robot_rallies` 0.01 %, `aimy`, `ballgun` and `strokes` none."""
 EVENLY: Final = 0.5  # m/s^2. Acceleration between samples below which a ball in flight did not move by itself
 SPAN: Final = 0.25  # s, of the cubics whose residuals show the errors
 LEAST_SPAN: Final = 8  # Samples, likewise
@@ -108,8 +117,9 @@ class Contents:
         held = np.concatenate(ratios)
         smoothing = float(np.quantile(held, UNDISTURBED)) if len(held) else np.nan
         share, strange = flying / samples, others(lost / samples, float(np.median(jumps or [0.0])))
-        flying = max(flying, 1.0)
-        return cls(pieces, share, smoothing, strange, repeated(again / flying), filled_in(filled / flying))
+        again, filled = again / max(flying, 1.0), filled / max(flying, 1.0)
+        not_measured = unmeasured(again, OTHERS, REPEATS), unmeasured(filled, FILLS, LINES)
+        return cls(pieces, share, smoothing, strange, *not_measured)
 
 
 @dataclass(frozen=True)
@@ -170,24 +180,9 @@ def others(lost: float, jump: float) -> str:
     return f"{100 * lost:.0f} % of the samples lie off the ball's path: they are {OTHER}" if lost > OTHERS else ""
 
 
-def repeated(share: float) -> str:
-    """The sentence on repeated positions; empty without. Args: share: of the samples of flying balls."""
-    if share <= OTHERS:
-        return ""
-    return (
-        f"{100 * share:.0f} % of the positions in flight repeat the one before them: {REPEATED}; leave the repeats "
-        "out, or velocities lag and sigmas are too small"
-    )
-
-
-def filled_in(share: float) -> str:
-    """The sentence on positions between measured ones; empty without. Args: share: of the samples of flying balls."""
-    if share <= FILLS:
-        return ""
-    return (
-        f"{100 * share:.0f} % of the positions in flight lie on straight lines, at even speed: {FILLED}; leave those "
-        "samples out, or the ball seems to fly straight on there and sigmas are too small"
-    )
+def unmeasured(share: float, least: float, what: str) -> str:
+    """The sentence on positions in flight that are no measurements; empty up to a least share of them."""
+    return f"{100 * share:.0f} % of the positions in flight {what}" if share > least else ""
 
 
 def on_lines(track: Track) -> Mask:
