@@ -31,6 +31,7 @@ from ballfg.diagnosis.search.evaluation import (
     unpopulated_model,
 )
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
+from ballfg.diagnosis.search.predicting import best_predicting, fitted_to_predictions, told_shifts
 from ballfg.diagnosis.search.ranking import at_bound, implausible
 from ballfg.diagnosis.search.stamp_effects import (
     as_declared,
@@ -87,23 +88,32 @@ def diagnose(
     of_fit = noise_of_all_frames(tracker, holdout.stamps, dataset)
     labels, of_labels = _labels(search, model, with_all_frames(holdout, dataset), holdout.stamps, of_fit, jobs)
     searched = len(np.unique(holdout.search.track))
-    of_noise = predicted_test(search.before, search.judged, searched)
-    tests = in_order(*generic_tests(search.fit, search.first, of_fit), of_noise, *of_labels)
+    of_fits = (*generic_tests(search.fit, search.first, of_fit), *of_labels)
+    tests = in_order(*of_fits, predicted_test(search.before, search.judged, searched))
+    probable = corrected
+    if verdict_of(search, tests) is Verdict.UNEXPLAINED:
+        tell("fitting coefficients to predictions")
+        corrected, search = _predicting(search, corrected, tracker, holdout, evaluate, jobs)
+        tests = in_order(*of_fits, predicted_test(search.before, search.judged, searched))
     helped = None
     if verdict_of(search, tests) is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
-        embedding, parts = holdout.launcher.embedding, holdout.search_tracks
-        helped = fallback(search.fit, embedding, corrected, holdout.dataset, parts, search.judged, evaluate, jobs)
+        helped = fallback(search.fit, corrected, search.judged, holdout, jobs)
     whole = next_shot_model(search.whole, holdout.launcher.embedding, corrected)
     whole.noise = corrected.noise
+    if corrected is not probable and helped is None:
+        every = (*holdout.search_tracks, *holdout.held_out_tracks)
+        whole = fitted_to_predictions(whole, search.free, every, holdout, jobs)
     whole.domain = Domain.of(dataset, [dataset.info.ball.radius]) if search.findings else model.domain
     found = told(search, model, dataset.info.name, whole, searched, tests, labels, helped)
     budget = budget_of(corrected, holdout, found.before.prediction_rmse_mm, found.after.prediction_rmse_mm, jobs)
     unpopulated = search.before
     if has_population(search.declared):
         unpopulated = evaluate(as_declared(unpopulated_model(search.declared, holdout, jobs), holdout.stamps))
+    shifts = told_shifts(corrected, probable, search.free)
     return replace(
         found,
+        remarks=(*found.remarks, *([shifts] if shifts else [])),
         unpopulated=unpopulated,
         noise=_noise(search.fit, holdout),
         excluded=holdout.excluded,
@@ -195,6 +205,22 @@ def _with_own_noise(
         findings=(*search.findings, *tracker.findings),
     )
     return corrected, tracker.noise, search
+
+
+def _predicting(
+    search: Search,
+    corrected: AnalyticModel,
+    tracker: TrackNoise | None,
+    holdout: Holdout,
+    evaluate: Callable[[BallModel], Errors],
+    jobs: int,
+) -> tuple[AnalyticModel, Search]:
+    """The corrected model and the declared one with the coefficients that predict best, and the search with both."""
+    declared = best_predicting(search.declared, search.first.problem.free, holdout, tracker, jobs)
+    best = declared if corrected is search.declared else best_predicting(corrected, search.free, holdout, tracker, jobs)
+    if declared is not search.declared:
+        search = replace(search, declared=declared, before=evaluate(as_declared(declared, holdout.stamps)))
+    return best, search if best is corrected else replace(search, predictive=best, judged=evaluate(best))
 
 
 def strange(fit: Fit, calibrated: Mapping[str, Value], radius: float) -> list[str]:

@@ -79,11 +79,11 @@ def headline(diagnosis: Diagnosis) -> str:
     if not effects and diagnosis.verdict is not Verdict.UNEXPLAINED:
         nothing = "No effect on the ball is missing" if diagnosis.findings else "Nothing that the model lacks was found"
         return f"{nothing}: {_quality(diagnosis)}, and what is left looks like noise."
+    described, alone = diagnosis.unexplained.fallback, ""
     if not effects:
         left = where(diagnosis.unexplained.where)
         said = f"Something is missing from the model that no known effect explains: {left}."
-        described = diagnosis.unexplained.fallback is not None
-        what = "With a description of the pattern that names no cause" if described else ""
+        what = "" if described is None else "With a description of the pattern that names no cause"
     elif len(effects) == 1:
         others, what = effects[0].indistinguishable_from, "With it"
         doubt = f" It may also be {_or(others)}: these tracks cannot tell." if others else ""
@@ -91,8 +91,11 @@ def headline(diagnosis: Diagnosis) -> str:
     else:
         count = COUNTS[len(effects)] if len(effects) < len(COUNTS) else f"{len(effects)}"
         said, what = f"{count} effects are missing from the model.", "With them"
+    if effects and described is not None:
+        alone = f"{what} alone, by {described.before.prediction_rmse_mm:.1f} mm."
+        what = f"{what} and a description of the rest that names no cause"
     more = "Something else is missing too." if effects and diagnosis.verdict is Verdict.UNEXPLAINED else ""
-    return " ".join(part for part in (said, gain(diagnosis, what), more) if part)
+    return " ".join(part for part in (said, gain(diagnosis, what), alone, more) if part)
 
 
 def further(diagnosis: Diagnosis) -> Iterator[str]:

@@ -3,7 +3,7 @@
 They are chosen by forward selection with the extended BIC (J. Chen and Z. Chen 2008, gamma = 1).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,19 +11,17 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.effects import has_effect
 from ballfg.diagnosis.fit.fit import fit_problem
-from ballfg.diagnosis.fit.holdout import EvaluationTrack
+from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.hypotheses.hypothesis import Hypothesis
 from ballfg.diagnosis.hypotheses.signatures import hypothesis_signatures
 from ballfg.diagnosis.result import Errors, Fallback
-from ballfg.diagnosis.search.evaluation import next_shot_model, noise_about
+from ballfg.diagnosis.search.evaluation import errors_of, next_shot_model, noise_about
 from ballfg.diagnosis.search.refits import with_hypothesis
-from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.registry import GENERIC
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.tracks import Dataset
 
-HELPS = 0.9  # Ratio of the prediction errors on the held-out half with and without an accepted fallback
+HELPS = 0.9  # Ratio of the prediction errors on the search half with and without an accepted fallback
 MOST_TERMS = 12  # Largest number of terms; more describe noise, and are unreadable
 LEAST_LEFT = 1e-6  # Least share of a term's information that is independent of the earlier terms
 
@@ -40,30 +38,23 @@ class SparseTerms:
     explained: float
 
 
-def fallback(
-    before: Fit,
-    embedding: SpinEmbedding,
-    corrected: AnalyticModel,
-    dataset: Dataset,
-    parts: Sequence[EvaluationTrack],
-    now: Errors,
-    evaluate: Callable[[BallModel], Errors],
-    jobs: int,
-) -> Fallback | None:
-    """A description of the rest without a name; None if nothing predicts better.
+def fallback(before: Fit, corrected: AnalyticModel, now: Errors, holdout: Holdout, jobs: int) -> Fallback | None:
+    """A description of the rest without a name; None if nothing predicts the search half better.
 
-    The previous fit and the tracks are those of the search half; `corrected` is the model of that fit, with its noise.
-    Its errors `now` and those from `evaluate` are those on the held-out half.
+    Args: before: the fit to the search half.  corrected: its model, with noise.  now: errors on the held-out half.
     """
     terms = sparse_terms(before)
     if terms is None:
         return None
     after = fit_with_terms(before, terms)
-    model = next_shot_model(after, embedding, corrected)
-    model.noise = noise_about(model, parts, dataset, corrected.noise, jobs=jobs)
-    errors = evaluate(model)
-    if errors.prediction_rmse_mm >= HELPS * now.prediction_rmse_mm:
+    model = next_shot_model(after, holdout.launcher.embedding, corrected)
+    model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, corrected.noise, jobs=jobs)
+    without, within = (
+        errors_of(one, holdout, holdout.search_tracks, jobs).prediction_rmse_mm for one in (corrected, model)
+    )
+    if within >= HELPS * without:
         return None
+    errors = errors_of(model, holdout, holdout.held_out_tracks, jobs)
     return Fallback("sparse terms", describe(terms, after), now, errors, model)
 
 
