@@ -108,6 +108,10 @@ def test_several_effects_are_counted_and_listed() -> None:
     weaker = replace(many, findings=(replace(WIND, held_out_p=1e-4),))
     assert next(certainty(weaker)).startswith("A wind: very likely. ")
     assert headline(replace(many, findings=(jitter,), verdict=Verdict.FOUND)).startswith("No effect on the ball")
+    described = replace(many, unexplained=replace(left, fallback=unexplained().unexplained.fallback))
+    alone = unexplained().unexplained.fallback.before.prediction_rmse_mm
+    assert "With them and a description of the rest that names no cause, predictions are off by" in headline(described)
+    assert f" mm. With them alone, by {alone:.1f} mm. Something else is missing too." in headline(described)
 
 
 def test_a_pattern_without_a_name() -> None:
