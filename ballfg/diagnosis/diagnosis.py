@@ -31,7 +31,7 @@ from ballfg.diagnosis.search.evaluation import (
     unpopulated_model,
 )
 from ballfg.diagnosis.search.loop import NAMED, Search, SearchLoop
-from ballfg.diagnosis.search.predicting import best_predicting, fitted_to_predictions, told_shifts
+from ballfg.diagnosis.search.predicting import best_predicting, told_shifts
 from ballfg.diagnosis.search.ranking import at_bound, implausible
 from ballfg.diagnosis.search.stamp_effects import (
     as_declared,
@@ -99,11 +99,10 @@ def diagnose(
     if verdict_of(search, tests) is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         helped = fallback(search.fit, corrected, search.judged, holdout, jobs)
-    whole = next_shot_model(search.whole, holdout.launcher.embedding, corrected)
-    whole.noise = corrected.noise
-    if corrected is not probable and helped is None:
-        every = (*holdout.search_tracks, *holdout.held_out_tracks)
-        whole = fitted_to_predictions(whole, search.free, every, holdout, jobs)
+    whole = corrected  # as judged, where it is fitted to predictions; else fitted to both halves
+    if corrected is probable:
+        whole = next_shot_model(search.whole, holdout.launcher.embedding, corrected)
+        whole.noise = corrected.noise
     whole.domain = Domain.of(dataset, [dataset.info.ball.radius]) if search.findings else model.domain
     found = told(search, model, dataset.info.name, whole, searched, tests, labels, helped)
     budget = budget_of(corrected, holdout, found.before.prediction_rmse_mm, found.after.prediction_rmse_mm, jobs)

@@ -255,7 +255,8 @@ class Diagnosis:
         tracks_found_on, tracks_judged_on: numbers of tracks of the search half and of the held-out half.
         calibrated: declared coefficients fitted with the corrected model to the tracks of both halves.
         noise: position noise along x, y, z as estimated (m), and as stated.
-        model: the corrected model. Without a fallback it is fitted to the tracks of both halves after its evaluation.
+        model: the corrected model. It is fitted to the tracks of both halves after its evaluation, unless the search
+            half fitted it to predictions or gave it a fallback.
         residuals_before, residuals_after: of the search half with the declared and with the corrected model.
         excluded: sentences on unused tracks.
         remarks: sentences on implausible fitted values.
