@@ -21,7 +21,7 @@ from ballfg.diagnosis.search.refits import with_hypothesis
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.registry import GENERIC
 
-HELPS = 0.9  # Ratio of the prediction errors on the search half with and without an accepted fallback
+HELPS = 0.9  # Ratio of the prediction errors on the held-out half with and without an accepted fallback
 MOST_TERMS = 12  # Largest number of terms; more describe noise, and are unreadable
 LEAST_LEFT = 1e-6  # Least share of a term's information that is independent of the earlier terms
 
@@ -39,7 +39,7 @@ class SparseTerms:
 
 
 def fallback(before: Fit, corrected: AnalyticModel, now: Errors, holdout: Holdout, jobs: int) -> Fallback | None:
-    """A description of the rest without a name; None if nothing predicts the search half better.
+    """A description of the rest without a name; None if nothing predicts better.
 
     Args: before: the fit to the search half.  corrected: its model, with noise.  now: errors on the held-out half.
     """
@@ -49,12 +49,9 @@ def fallback(before: Fit, corrected: AnalyticModel, now: Errors, holdout: Holdou
     after = fit_with_terms(before, terms)
     model = next_shot_model(after, holdout.launcher.embedding, corrected)
     model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, corrected.noise, jobs=jobs)
-    without, within = (
-        errors_of(one, holdout, holdout.search_tracks, jobs).prediction_rmse_mm for one in (corrected, model)
-    )
-    if within >= HELPS * without:
-        return None
     errors = errors_of(model, holdout, holdout.held_out_tracks, jobs)
+    if errors.prediction_rmse_mm >= HELPS * now.prediction_rmse_mm:
+        return None
     return Fallback("sparse terms", describe(terms, after), now, errors, model)
 
 

@@ -13,7 +13,7 @@ from ballfg.diagnosis.search.found import Found
 from ballfg.diagnosis.search.models import with_strengths_of
 from ballfg.diagnosis.search.ranking import finding_of, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings
-from ballfg.dynamics import AnalyticModel, BallModel, Coefficient
+from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.dynamics.effect import Effect
 
 NAMED = 0.9  # Probability above which an effect is named
@@ -36,7 +36,7 @@ class Search:
     sigmas: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations of the coefficients of `whole`, beside what differs from track to track."""
     scatter: Mapping[str, float] = field(default_factory=dict)  # What coefficients differ by from track to track
-    free: Mapping[str, Coefficient] = field(default_factory=dict)  # Those of the model with the named effects
+    free: frozenset[str] = frozenset()  # Names of the fitted coefficients of the model with the named effects
 
 
 @dataclass(frozen=True)
@@ -111,5 +111,5 @@ class SearchLoop:
             odds,
             plain.sigmas,
             plain.scatter,
-            {**first.problem.free, **fit.problem.free, **(final.fit.problem.free if final.named else {})},
+            frozenset((*fit.problem.free, *(final.fit.problem.free if final.named else ()))),
         )

@@ -7,7 +7,7 @@ moments to the end of each track correct that; from a single moment, coefficient
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, Self
@@ -61,15 +61,15 @@ class _Predictions:
     def of(
         cls,
         model: AnalyticModel,
-        free: Mapping[str, Coefficient],
+        priors: Mapping[str, Coefficient],
         parts: Sequence[EvaluationTrack],
         holdout: Holdout,
         jobs: int,
     ) -> Self:
-        """Of a model whose coefficients `free` are fitted."""
-        values = {name: float(value.detach()) for name, value in model.named_parameters() if name in free}
+        """Of a model and the coefficients that are fitted, with their priors."""
+        values = {name: float(value.detach()) for name, value in model.named_parameters() if name in priors}
         some = tuple(spread_over((part.track for part in parts), len(parts), MOST_FOR_NOISE))
-        sigma = np.array([free[name].sigma for name in values])
+        sigma = np.array([priors[name].sigma for name in values])
         about = cls(model, tuple(values), np.array([*values.values()]), sigma, some, holdout, jobs, {})
         made = do_all([partial(about.made, np.zeros(len(values)), share) for share in SHARES], jobs)
         sigmas = {key: sigma for of_share in made for key, (_, sigma) in of_share.items()}
@@ -116,13 +116,18 @@ class _Predictions:
         return np.concatenate([np.full(len(p), np.sqrt(min(1.0, FAR / s))) for p, s in zip(parts, size, strict=True)])
 
 
+def _priors(model: AnalyticModel, free: Collection[str]) -> dict[str, Coefficient]:
+    """Coefficients of these names as their effects declare them; a search lets data decide with wider priors."""
+    return {name: c for name, c in model.declared_coefficients().items() if name in free and c.sigma > 0.0}
+
+
 def _until(share: float, track: Track) -> float:
     return share * track.duration
 
 
 def fitted_to_predictions(
     model: AnalyticModel,
-    free: Mapping[str, Coefficient],
+    free: Collection[str],
     parts: Sequence[EvaluationTrack],
     holdout: Holdout,
     jobs: int = 1,
@@ -131,12 +136,13 @@ def fitted_to_predictions(
 
     Gauss-Newton from the model's own coefficients: slopes by differences there, then by Broyden's rule.
 
-    Args: free: coefficients with their priors and bounds, by parameter name.  parts: tracks.  jobs: processes.
+    Args: free: names of the coefficients; those that the model takes as exact stay.  parts: tracks.  jobs: processes.
     """
-    asked = _Predictions.of(model, free, parts, holdout, jobs)
+    priors = _priors(model, free)
+    asked = _Predictions.of(model, priors, parts, holdout, jobs)
     if not asked.names or not asked.sigmas:
         return model
-    low, high = (np.array([getattr(free[name], end) for name in asked.names]) for end in ("low", "high"))
+    low, high = (np.array([getattr(priors[name], end) for name in asked.names]) for end in ("low", "high"))
     low, high = (low - asked.start) / asked.sigma, (high - asked.start) / asked.sigma
     steps = np.diag(np.where(high > DIFFERENCE, DIFFERENCE, -DIFFERENCE))
     errors, *moved = asked.errors([np.zeros(len(steps)), *steps])
@@ -165,7 +171,7 @@ def fitted_to_predictions(
 
 def best_predicting(
     model: AnalyticModel,
-    free: Mapping[str, Coefficient],
+    free: Collection[str],
     holdout: Holdout,
     tracker: TrackNoise | None = None,
     jobs: int = 1,
@@ -194,17 +200,16 @@ def best_predicting(
     return best[1]
 
 
-def told_shifts(model: AnalyticModel, before: AnalyticModel, free: Mapping[str, Coefficient]) -> str:
+def told_shifts(model: AnalyticModel, before: AnalyticModel, free: Collection[str]) -> str:
     """A sentence on the coefficients that predict best where they are not the most probable ones; none: empty."""
     values = [{name: float(value.detach()) for name, value in one.named_parameters()} for one in (model, before)]
-    moved = {name: abs(values[0][name] - values[1][name]) / c.sigma for name, c in free.items() if name in values[0]}
+    priors = _priors(model, free)
+    moved = {name: abs(values[0][name] - values[1][name]) / c.sigma for name, c in priors.items()}
     most = [name for name in sorted(moved, key=lambda name: -moved[name]) if moved[name] >= TOLD][:MOST_TOLD]
     if not most:
         return ""
-    words = [
-        f"{name.partition('.')[2]} {values[0][name]:.3g} for {values[1][name]:.3g} {free[name].unit}".removesuffix(" 1")
-        for name in most
-    ]
+    changes = ((name, *(f"{of[name]:.3g}" for of in values), priors[name].unit) for name in most)
+    words = [f"{name.partition('.')[2]} {now} for {was} {unit}".removesuffix(" 1") for name, now, was, unit in changes]
     return (
         "Something is lacking still: the corrected model has the coefficients that predict best, not the most probable "
         f"ones, among them {', '.join(words)}."

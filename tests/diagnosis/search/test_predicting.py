@@ -28,7 +28,7 @@ NAMES = ("flight.drag.k", "bounce.restitution.e")
 
 @pytest.fixture(scope="module")
 def right(tmp_path_factory):
-    """Twenty-four simulated tracks in halves, their own model, and the coefficients that are fitted."""
+    """Twenty-four simulated tracks in halves, their own model, and the priors of the coefficients that are fitted."""
     folder = tmp_path_factory.mktemp("predicting") / "right"
     write_simulation(folder, SimulationConfig(tracks=24, seed=31))
     model = load_model(folder / "model.yaml")
