@@ -113,7 +113,7 @@ class _Predictions:
         ends = np.cumsum([sigmas.size for sigmas in self.sigmas.values()])[:-1]
         parts = np.split(errors, ends)
         size = [np.sqrt((part**2).sum() * len(SHARES) / NUMBERS) for part in parts]
-        return np.concatenate([np.full(len(p), np.sqrt(min(1.0, FAR / s))) for p, s in zip(parts, size, strict=True)])
+        return np.concatenate([np.full(len(p), np.sqrt(FAR / max(FAR, s))) for p, s in zip(parts, size, strict=True)])
 
 
 def _priors(model: AnalyticModel, free: Collection[str]) -> dict[str, Coefficient]:
