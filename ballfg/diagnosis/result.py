@@ -259,7 +259,7 @@ class Diagnosis:
             half fitted it to predictions or gave it a fallback.
         residuals_before, residuals_after: of the search half with the declared and with the corrected model.
         excluded: sentences on unused tracks.
-        remarks: sentences on implausible fitted values.
+        remarks: sentences on implausible values, differences between tracks, coefficients that predictions moved.
         floor_mm: prediction error of the held-out tracks for an exact corrected model, from measurement noise and the
             unknown release alone: `budget.exact`; NaN if unknown.
         labels: verdicts on the spin labels; None without labels.

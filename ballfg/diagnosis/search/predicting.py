@@ -13,10 +13,9 @@ from functools import partial
 from typing import Final, Self
 
 import numpy as np
-import torch
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
+from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.search.evaluation import (
     LEAST_PREDICTED,
     MOST_FOR_NOISE,
@@ -24,11 +23,12 @@ from ballfg.diagnosis.search.evaluation import (
     errors_of,
     noise_about,
 )
-from ballfg.dynamics import AnalyticModel, Coefficient
+from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import dataset_settings, predict_tracks
 from ballfg.estimation.batch import do_all
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.estimation.registry import make_estimator
+from ballfg.learning.calibration.coefficients import Chosen, choose, values_of, with_values
 from ballfg.tracks import Track
 from ballfg.tracks.noise import TrackNoise
 
@@ -46,34 +46,27 @@ MOST_TOLD: Final = 3
 
 @dataclass(frozen=True)
 class _Predictions:
-    """The predictions of some tracks, as a function of coefficients in prior deviations from those of the model."""
+    """The predictions of the search half, as a function of coefficients in prior deviations from those of the model."""
 
     model: AnalyticModel
-    names: tuple[str, ...]
-    start: Array  # (p,) the model's values
-    sigma: Array  # (p,)
+    chosen: Chosen
     tracks: tuple[Track, ...]
     holdout: Holdout
     jobs: int
     sigmas: Mapping[tuple[float, str], Array]  # (k, 3) m, by share and track: of the model's own predictions
+    own: Array  # (e,) whitened errors of these
 
     @classmethod
-    def of(
-        cls,
-        model: AnalyticModel,
-        priors: Mapping[str, Coefficient],
-        parts: Sequence[EvaluationTrack],
-        holdout: Holdout,
-        jobs: int,
-    ) -> Self:
-        """Of a model and the coefficients that are fitted, with their priors."""
-        values = {name: float(value.detach()) for name, value in model.named_parameters() if name in priors}
+    def of(cls, model: AnalyticModel, chosen: Chosen, holdout: Holdout, jobs: int) -> Self:
+        """Of a model and the coefficients that are fitted."""
+        parts = holdout.search_tracks
         some = tuple(spread_over((part.track for part in parts), len(parts), MOST_FOR_NOISE))
-        sigma = np.array([priors[name].sigma for name in values])
-        about = cls(model, tuple(values), np.array([*values.values()]), sigma, some, holdout, jobs, {})
-        made = do_all([partial(about.made, np.zeros(len(values)), share) for share in SHARES], jobs)
-        sigmas = {key: sigma for of_share in made for key, (_, sigma) in of_share.items()}
-        return replace(about, sigmas=sigmas)
+        asked = cls(model, chosen, some, holdout, jobs, {}, np.zeros(0))
+        made = do_all([partial(asked.made, np.zeros(len(chosen.names)), share) for share in SHARES], jobs)
+        every = {key: one for of_share in made for key, one in of_share.items()}
+        asked = replace(asked, sigmas={key: sigmas for key, (_, sigmas) in every.items()})
+        own = [asked._whitened(key, errors) for key, (errors, _) in every.items()]
+        return replace(asked, own=np.concatenate(own or [np.zeros(0)]))
 
     def made(self, away: Array, share: float) -> dict[tuple[float, str], tuple[Array, Array]]:
         """Errors (k, 3) and their standard deviations, m, by share and track."""
@@ -86,12 +79,7 @@ class _Predictions:
 
     def at(self, away: Array) -> AnalyticModel:
         """A copy of the model with other coefficients."""
-        model = copy.deepcopy(self.model)
-        parameters = dict(model.named_parameters())
-        with torch.no_grad():
-            for name, value in zip(self.names, (self.start + away * self.sigma).tolist(), strict=True):
-                parameters[name].fill_(value)
-        return model
+        return with_values(self.model, self.chosen.names, self.chosen.start + away * self.chosen.sigma)
 
     def errors(self, away: Sequence[Array]) -> list[Array]:
         """(e,) whitened errors at each of some coefficients (p,); those of a track count as `NUMBERS`."""
@@ -116,9 +104,9 @@ class _Predictions:
         return np.concatenate([np.full(len(p), np.sqrt(FAR / max(FAR, s))) for p, s in zip(parts, size, strict=True)])
 
 
-def _priors(model: AnalyticModel, free: Collection[str]) -> dict[str, Coefficient]:
+def _chosen(model: AnalyticModel, free: Collection[str]) -> Chosen:
     """Coefficients of these names as their effects declare them; a search lets data decide with wider priors."""
-    return {name: c for name, c in model.declared_coefficients().items() if name in free and c.sigma > 0.0}
+    return choose(model, [name for name, c in model.declared_coefficients().items() if name in free and c.sigma > 0.0])
 
 
 def _until(share: float, track: Track) -> float:
@@ -126,30 +114,24 @@ def _until(share: float, track: Track) -> float:
 
 
 def fitted_to_predictions(
-    model: AnalyticModel,
-    free: Collection[str],
-    parts: Sequence[EvaluationTrack],
-    holdout: Holdout,
-    jobs: int = 1,
+    model: AnalyticModel, free: Collection[str], holdout: Holdout, jobs: int = 1
 ) -> AnalyticModel:
-    """A copy of a predictive model with the coefficients that predict some tracks best, beside their priors.
+    """A copy of a predictive model with the coefficients that predict the search half best, beside their priors.
 
     Gauss-Newton from the model's own coefficients: slopes by differences there, then by Broyden's rule.
 
-    Args: free: names of the coefficients; those that the model takes as exact stay.  parts: tracks.  jobs: processes.
+    Args: free: names of the coefficients; those that the model takes as exact stay.  jobs: processes.
     """
-    priors = _priors(model, free)
-    asked = _Predictions.of(model, priors, parts, holdout, jobs)
-    if not asked.names or not asked.sigmas:
+    chosen = _chosen(model, free)
+    asked = _Predictions.of(model, chosen, holdout, jobs)
+    if not chosen.names or not asked.sigmas:
         return model
-    low, high = (np.array([getattr(priors[name], end) for name in asked.names]) for end in ("low", "high"))
-    low, high = (low - asked.start) / asked.sigma, (high - asked.start) / asked.sigma
+    low, high = ((end - chosen.start) / chosen.sigma for end in (chosen.low, chosen.high))
     steps = np.diag(np.where(high > DIFFERENCE, DIFFERENCE, -DIFFERENCE))
-    errors, *moved = asked.errors([np.zeros(len(steps)), *steps])
-    known = np.isfinite(errors)
-    weights = asked.weights(np.where(known, errors, 0.0))[known]
-    errors = weights * errors[known]
-    columns = [weights * column[known] for column in moved]
+    known = np.isfinite(asked.own)
+    weights = asked.weights(np.where(known, asked.own, 0.0))[known]
+    errors = weights * asked.own[known]
+    columns = [weights * column[known] for column in asked.errors([*steps])]
     slopes = np.stack([np.nan_to_num(c - errors) / s for c, s in zip(columns, steps.diagonal(), strict=True)], axis=1)
     away, damping = np.zeros(len(steps)), 1.0
     for _ in range(MOST_STEPS):
@@ -188,7 +170,7 @@ def best_predicting(
 
     best = judged(model)
     for _ in range(MOST_ROUNDS):
-        fitted = fitted_to_predictions(best[1], free, holdout.search_tracks, holdout, jobs)
+        fitted = fitted_to_predictions(best[1], free, holdout, jobs)
         own = copy.deepcopy(fitted)
         own.noise = noise_about(own, holdout.search_tracks, holdout.dataset, tracker, jobs=jobs)
         found = max(judged(fitted), judged(own), key=lambda one: one[0])
@@ -202,14 +184,17 @@ def best_predicting(
 
 def told_shifts(model: AnalyticModel, before: AnalyticModel, free: Collection[str]) -> str:
     """A sentence on the coefficients that predict best where they are not the most probable ones; none: empty."""
-    values = [{name: float(value.detach()) for name, value in one.named_parameters()} for one in (model, before)]
-    priors = _priors(model, free)
-    moved = {name: abs(values[0][name] - values[1][name]) / c.sigma for name, c in priors.items()}
-    most = [name for name in sorted(moved, key=lambda name: -moved[name]) if moved[name] >= TOLD][:MOST_TOLD]
+    chosen = _chosen(model, free)
+    was = values_of(before, chosen.names)
+    moved = np.abs(chosen.start - was) / chosen.sigma
+    most = [k for k in np.argsort(-moved, kind="stable")[:MOST_TOLD] if moved[k] >= TOLD]
     if not most:
         return ""
-    changes = ((name, *(f"{of[name]:.3g}" for of in values), priors[name].unit) for name in most)
-    words = [f"{name.partition('.')[2]} {now} for {was} {unit}".removesuffix(" 1") for name, now, was, unit in changes]
+    words = [
+        f"{chosen.names[k].partition('.')[2]} {now:.3g} for {was[k]:.3g} {chosen.units[k]}".removesuffix(" 1")
+        for k in most
+        for now in [chosen.start[k]]
+    ]
     return (
         "Something is lacking still: the corrected model has the coefficients that predict best, not the most probable "
         f"ones, among them {', '.join(words)}."

@@ -19,6 +19,7 @@ from ballfg.diagnosis.search.predicting import (
     told_shifts,
 )
 from ballfg.dynamics import load_model
+from ballfg.learning.calibration.coefficients import choose
 from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import read_dataset
 from ballfg.tracks.noise import TrackNoise
@@ -55,7 +56,7 @@ def test_wrong_coefficients_come_back(right):
     holdout, model, free = right
     k, e = (value(model, name) for name in NAMES)
     wrong = off(model, **{"flight.drag.k": 1.25 * k, "bounce.restitution.e": e - 0.03})
-    fitted = fitted_to_predictions(wrong, free, holdout.search_tracks, holdout)
+    fitted = fitted_to_predictions(wrong, free, holdout)
     assert value(fitted, "flight.drag.k") == pytest.approx(k, rel=0.04)
     assert value(fitted, "bounce.restitution.e") == pytest.approx(e, abs=0.004)
     assert value(wrong, "flight.drag.k") == pytest.approx(1.25 * k)  # the model that is given stays
@@ -66,16 +67,16 @@ def test_the_same_coefficients_as_by_another_solver(right):
     """Trust region with differences at each point, by scipy, of the same errors and priors."""
     holdout, model, free = right
     wrong = off(model, **{"flight.drag.k": 1.25 * value(model, "flight.drag.k")})
-    asked = _Predictions.of(wrong, free, holdout.search_tracks, holdout, 1)
-    start = asked.errors([np.zeros(2)])[0]
-    weights = asked.weights(start)
+    asked = _Predictions.of(wrong, choose(wrong, NAMES), holdout, 1)
+    weights = asked.weights(asked.own)
+    np.testing.assert_array_equal(asked.errors([np.zeros(2)])[0], asked.own)
 
     def all_errors(away):
         return np.concatenate((weights * asked.errors([away])[0], away))
 
     other = least_squares(all_errors, np.zeros(2), diff_step=0.01, xtol=1e-4, ftol=1e-5).x
-    fitted = fitted_to_predictions(wrong, free, holdout.search_tracks, holdout)
-    away = [(value(fitted, n) - value(wrong, n)) / free[n].sigma for n in asked.names]
+    fitted = fitted_to_predictions(wrong, free, holdout)
+    away = [(value(fitted, n) - value(wrong, n)) / free[n].sigma for n in asked.chosen.names]
     assert abs(away[0]) > 0.5
     np.testing.assert_allclose(away, other, atol=0.05)  # prior deviations
 
