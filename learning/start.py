@@ -17,9 +17,9 @@ from ballfg.estimation import Settings
 from ballfg.estimation.configure import dataset_surfaces, fitted_settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.registry import make_estimator
-from ballfg.learning.calibration.auto import LEAST, NEAR, UNLEARNED, Choice, choose_candidate, compared
-from ballfg.learning.calibration.calibrate import fitted_noise
-from ballfg.learning.calibration.problem import Problem, population_model, population_settings, pose
+from ballfg.learning.calibration.auto import LEAST, UNLEARNED, Choice, choose_candidate, compared
+from ballfg.learning.calibration.predicting import finished
+from ballfg.learning.calibration.problem import NEAR, Problem, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.training import ObserveConfig, TrainConfig
 from ballfg.learning.evaluation import TrackScore, judge_track
@@ -94,10 +94,10 @@ def calibrated_start(config: TrainConfig, folder: Path, *, resume: bool, watch: 
         choice, found = choose_candidate(problem, watch)
         print(f"the training tracks choose what the network starts from:\n{choice.table()}\n{choice.verdict()}")
         if choice.chosen not in UNLEARNED:
-            posed, last = found[choice.chosen].problem, found[choice.chosen].steps[-1]
-            model, settings = population_model(posed, last), population_settings(posed, last)
-            noise = fitted_noise(posed, model, settings, watch, errors=False)
-            describe(model, posed, settings, noise)
+            posed = found[choice.chosen].problem
+            made = finished(posed, found[choice.chosen].steps[-1], watch, errors=False)
+            model = made.model
+            describe(model, posed, made.settings, made.noise)
         save_model(model, start.calibrated)
         base = copy.copy(model)
         base.variations = {}

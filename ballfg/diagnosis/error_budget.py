@@ -9,7 +9,7 @@ from ballfg.arrays import Mask
 from ballfg.diagnosis.budget import ErrorBudget
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, analytic, hold_out
 from ballfg.diagnosis.residual_tests.tracker_errors import look_at_tracker
-from ballfg.diagnosis.search.evaluation import LEAST_PREDICTED, OBSERVED, errors_of, noise_about, predictive_model
+from ballfg.diagnosis.search.evaluation import OBSERVED, errors_of, noise_about, predictive_model
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, with_errors_of_counting
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Settings, dataset_settings
@@ -17,6 +17,7 @@ from ballfg.estimation.noise.estimate import linearised
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.noise.parameters import noise_of
 from ballfg.estimation.noise.sources import SOURCES, squares_by_source
+from ballfg.learning.calibration.forecasts import LEAST_PREDICTED
 from ballfg.tracks import Dataset
 
 

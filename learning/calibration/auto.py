@@ -17,9 +17,10 @@ from ballfg.checks import aligned
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
-from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.calibration import calibrate
+from ballfg.learning.calibration.forecasts import moments
 from ballfg.learning.calibration.groups import OWN, Groups
+from ballfg.learning.calibration.predicting import about_population, best_predicting, predicted
 from ballfg.learning.calibration.problem import Linear, Problem, Step, judged, population_model, population_settings
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Plain, TrackScore, summary
@@ -38,8 +39,6 @@ in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. 
 priors and its population contain the simpler models, and it costs 0.001 in those worlds."""
 NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
-NEAR: Final = 0.3
-"""s, longest judged forecast, as for the noise (`estimate_noise`): later on, contacts decide more than the air."""
 LEAST: Final = 4  # Fitted tracks that a choice needs
 FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candidates that judge a part
 
@@ -147,15 +146,16 @@ def _fitted(problem: Problem, watch: Watch) -> tuple[Fitted, Linear]:
 
 def _folds(fitted: Fitted, linear: Linear, noise: NoiseEstimate | None, watch: Watch) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks' forecasts, each by the population of the other folds, with the noise of all."""
-    problem, names = fitted.problem, fitted.problem.split.fit
+    problem, names, last = fitted.problem, fitted.problem.split.fit, fitted.steps[-1]
+    shown = population_settings(problem, last) if noise is None else noise.settings
+    predictions = predicted(problem, last, shown, watch)
     made: list[tuple[AnalyticModel, Settings]] = []
     for k in range(min(FOLDS, len(names))):
-        step = calibrate.advanced(problem, fitted.steps[-2], linear.without(names[k::FOLDS]))
+        out = names[k::FOLDS]
+        step = calibrate.advanced(problem, fitted.steps[-2], linear.without(out))
+        step = best_predicting(step, predictions, out)
         settings = population_settings(problem, step)
-        if noise is not None:
-            own = settings.coefficients
-            spreads = {name: factor * own[name] for name, factor in noise.coefficient_factors.items()}
-            settings = with_noise(settings, replace(noise.noise, coefficients=spreads))
+        settings = settings if noise is None else about_population(noise, settings).settings
         made.append((population_model(problem, step), settings))
     return _judged(problem, made, watch)
 
@@ -164,9 +164,8 @@ def _judged(
     problem: Problem, made: Sequence[tuple[AnalyticModel, Settings]], watch: Watch
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks' forecasts: from the config's share of each, and half-way before and after it."""
-    share, longest = problem.config.observed_share, problem.config.horizon
-    shares, horizon = (share / 2.0, share, (1.0 + share) / 2.0), NEAR if longest is None else min(NEAR, longest)
-    return judged(problem, made, problem.split.fit, shares, horizon, watch)
+    shares = moments(problem.config.observed_share)
+    return judged(problem, made, problem.split.fit, shares, problem.nearest, watch)
 
 
 def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:

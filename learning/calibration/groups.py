@@ -46,6 +46,14 @@ class GroupSpin(Plain):
     spread: Three = (0.0, 0.0, 0.0)  # Standard deviations between tracks
     next_track: Three = (0.0, 0.0, 0.0)  # Standard deviations of a new track's spin about the mean
 
+    def moved(self, shift: Array, factor: Array) -> "GroupSpin":
+        """With another mean, and standard errors times some factors. Args: shift: (3,) rad/s.  factor: (3,)."""
+        mean, sigma, wide = (np.array(values) for values in (self.mean, self.sigma, self.next_track))
+        own = sigma * factor
+        found = (mean + shift, own, np.sqrt(np.maximum(wide**2 - sigma**2, 0.0) + own**2))
+        parts = zip(("mean", "sigma", "next_track"), (tuple(one.tolist()) for one in found), strict=True)
+        return self.model_copy(update=dict(parts))
+
     @classmethod
     def rows(cls, mean: Array, sigma: Array, spread: Array, next_track: Array, first: int) -> "tuple[GroupSpin, ...]":
         """Of each group. Args: mean, sigma, spread, next_track: (first + 3 groups,) the coefficients come first."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
-from typing import Self
+from typing import Final, Self
 
 import numpy as np
 from pydantic import Field
@@ -29,6 +29,10 @@ from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.noise import TrackNoise
 
+NEAR: Final = 0.3
+"""s, longest forecast that chooses or teaches, as for the noise (`estimate_noise`): later on, contacts decide more than
+the air."""
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -45,6 +49,11 @@ class Problem:
     groups: Groups | None = None
     correction: Correction | None = None
     shown: TrackNoise | None = None  # The noise that the fitted tracks are linearised with; None: the settings'
+
+    @property
+    def nearest(self) -> float:
+        """s, horizon of the forecasts that choose and teach: the config's, but at most `NEAR`."""
+        return NEAR if self.config.horizon is None else min(NEAR, self.config.horizon)
 
     @property
     def linearising(self) -> Settings:
@@ -81,6 +90,8 @@ class Step(Plain):
     moved: float | None = None  # Largest move of a mean in this step, in standard errors
     fits: tuple[TrackFit, ...] = ()  # Posteriors of the tracks that were used
     skipped: tuple[tuple[str, str], ...] = ()  # Name and reason of each track that was not used
+    predicting: float | None = None
+    """Gain in the log score of left-out tracks by means that predict best; None: the means are the most probable."""
     scores: tuple[TrackScore | None, ...] = ()
     """Scores of the judging tracks with the mean of this step; None where a track could not be judged."""
 

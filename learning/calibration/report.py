@@ -102,6 +102,7 @@ def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEst
             "worse": outcome(comparison) == "worse",
         },
         "noise": shown,
+        "predicting_gain": last.predicting,
         "verdict": verdict(problem, last, comparison),
     }
 
@@ -174,6 +175,11 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
         )
         if problem.dataset.rough:
             sentences.append("Errors are those across the rays of the cameras' sightings.")
+    if last.predicting is not None:
+        sentences.append(
+            f"The means are those that predict best, by {last.predicting:+.3f} in the log score of fitted tracks that "
+            "were left out, not the most probable ones: the model lacks something."
+        )
     if comparison.with_spread is not None:
         sentences.append(
             f"With the population as each track's prior it has {1e3 * comparison.with_spread.rmse_median:.1f} mm."

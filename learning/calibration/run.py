@@ -35,7 +35,8 @@ from ballfg.learning.calibration.calibrate import (
     with_shown_noise,
 )
 from ballfg.learning.calibration.picture import draw
-from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose, score
+from ballfg.learning.calibration.predicting import finished
+from ballfg.learning.calibration.problem import Problem, Step, pose, score
 from ballfg.learning.calibration.report import compare, outcome, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
@@ -192,9 +193,9 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch,
 
     Returns: the exit status. Args: proven: as of `status_of`.
     """
-    last = steps[-1]
-    population, model = population_settings(problem, last), population_model(problem, last)
-    noise = fitted_noise(problem, model, population, watch)
+    made = finished(problem, steps[-1], watch)
+    model, population, noise = made.model, made.settings, made.noise
+    last = made.step if made.step is steps[-1] else with_scores(problem, made.step, watch)
     spread = score(problem, model, population, watch)
     shown = spread if noise is None else score(problem, model, noise.settings, watch)
     after = last.scores if problem.correction is None else spread  # a correction goes with its spins

@@ -32,12 +32,12 @@ from ballfg.estimation.noise.estimate import spread_over
 from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.track_prediction import TrackPrediction
+from ballfg.learning.calibration.forecasts import LEAST_PREDICTED
 from ballfg.prediction.apexes import flight_bounds, measured_apexes, path_apex
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.noise import TrackNoise
 
 OBSERVED = 0.4  # Observed share of each track; the rest is predicted
-LEAST_PREDICTED = 3  # Least number of predicted samples
 
 
 def prediction_errors(

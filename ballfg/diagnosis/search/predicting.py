@@ -7,34 +7,23 @@ moments to the end of each track correct that; from a single moment, coefficient
 """
 
 import copy
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection
 from functools import partial
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.holdout import Holdout
-from ballfg.diagnosis.search.evaluation import (
-    LEAST_PREDICTED,
-    MOST_FOR_NOISE,
-    OBSERVED,
-    errors_of,
-    noise_about,
-)
+from ballfg.diagnosis.search.evaluation import MOST_FOR_NOISE, OBSERVED, errors_of, noise_about
 from ballfg.dynamics import AnalyticModel
-from ballfg.estimation import dataset_settings, predict_tracks
-from ballfg.estimation.batch import do_all
+from ballfg.estimation import Estimator, dataset_settings
 from ballfg.estimation.noise.estimate import spread_over
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.coefficients import Chosen, choose, values_of, with_values
-from ballfg.tracks import Track
+from ballfg.learning.calibration.forecasts import Forecasts, moments
 from ballfg.tracks.noise import TrackNoise
 
-SHARES: Final = (OBSERVED / 2.0, OBSERVED, (1.0 + OBSERVED) / 2.0)  # Observed shares of a track; the rest is predicted
-NUMBERS: Final = 3.0  # What the errors of one track's predictions count as: they hang together, along each axis
-FAR: Final = 2.0  # Whitened error, root mean square, from which on a prediction counts less (Huber)
 DIFFERENCE: Final = 0.03  # Step of a difference, in prior deviations of the coefficient
 MOST_STEPS: Final = 6
 WORTH_A_STEP: Final = 0.5  # Least promised gain of a step, natural units
@@ -44,73 +33,27 @@ TOLD: Final = 0.2  # Change of a coefficient, in prior deviations, from which on
 MOST_TOLD: Final = 3
 
 
-@dataclass(frozen=True)
-class _Predictions:
-    """The predictions of the search half, as a function of coefficients in prior deviations from those of the model."""
+def forecasts(model: AnalyticModel, chosen: Chosen, holdout: Holdout, jobs: int) -> Forecasts:
+    """The predictions of the search half as a function of coefficients, in prior deviations from those of the model."""
+    parts = holdout.search_tracks
+    some = spread_over((part.track for part in parts), len(parts), MOST_FOR_NOISE)
+    size = len(chosen.names)
+    return Forecasts.of(partial(_estimator, model, chosen, holdout), size, tuple(some), moments(OBSERVED), jobs=jobs)
 
-    model: AnalyticModel
-    chosen: Chosen
-    tracks: tuple[Track, ...]
-    holdout: Holdout
-    jobs: int
-    sigmas: Mapping[tuple[float, str], Array]  # (k, 3) m, by share and track: of the model's own predictions
-    own: Array  # (e,) whitened errors of these
 
-    @classmethod
-    def of(cls, model: AnalyticModel, chosen: Chosen, holdout: Holdout, jobs: int) -> Self:
-        """Of a model and the coefficients that are fitted."""
-        parts = holdout.search_tracks
-        some = tuple(spread_over((part.track for part in parts), len(parts), MOST_FOR_NOISE))
-        asked = cls(model, chosen, some, holdout, jobs, {}, np.zeros(0))
-        made = do_all([partial(asked.made, np.zeros(len(chosen.names)), share) for share in SHARES], jobs)
-        every = {key: one for of_share in made for key, one in of_share.items()}
-        asked = replace(asked, sigmas={key: sigmas for key, (_, sigmas) in every.items()})
-        own = [asked._whitened(key, errors) for key, (errors, _) in every.items()]
-        return replace(asked, own=np.concatenate(own or [np.zeros(0)]))
+def _estimator(model: AnalyticModel, chosen: Chosen, holdout: Holdout, away: Array) -> Estimator:
+    moved = _moved(model, chosen, away)
+    return make_estimator("smoother", moved, holdout.surfaces, dataset_settings(holdout.dataset, moved))
 
-    def made(self, away: Array, share: float) -> dict[tuple[float, str], tuple[Array, Array]]:
-        """Errors (k, 3) and their standard deviations, m, by share and track."""
-        model = self.at(away)
-        settings = dataset_settings(self.holdout.dataset, model)
-        estimator = make_estimator("smoother", model, self.holdout.surfaces, settings)
-        predictions = predict_tracks(estimator, self.tracks, len(self.tracks), partial(_until, share))
-        kept = (p for p in predictions if len(p.times) >= LEAST_PREDICTED)
-        return {(share, p.name): (p.positions - p.measured, p.sigmas) for p in kept}
 
-    def at(self, away: Array) -> AnalyticModel:
-        """A copy of the model with other coefficients."""
-        return with_values(self.model, self.chosen.names, self.chosen.start + away * self.chosen.sigma)
-
-    def errors(self, away: Sequence[Array]) -> list[Array]:
-        """(e,) whitened errors at each of some coefficients (p,); those of a track count as `NUMBERS`."""
-        tasks = [partial(self.made, one, share) for one in away for share in SHARES]
-        made, found = do_all(tasks, self.jobs), []
-        for k in range(0, len(made), len(SHARES)):
-            every = {key: errors for of_share in made[k : k + len(SHARES)] for key, (errors, _) in of_share.items()}
-            found.append(np.concatenate([self._whitened(key, every.get(key)) for key in self.sigmas]))
-        return found
-
-    def _whitened(self, key: tuple[float, str], errors: Array | None) -> Array:
-        sigmas = self.sigmas[key]
-        if errors is None:
-            return np.full(sigmas.size, np.nan)
-        return np.asarray((errors / sigmas).ravel() * np.sqrt(NUMBERS / (len(SHARES) * sigmas.size)))
-
-    def weights(self, errors: Array) -> Array:
-        """(e,) square roots of the predictions' weights by their whitened errors."""
-        ends = np.cumsum([sigmas.size for sigmas in self.sigmas.values()])[:-1]
-        parts = np.split(errors, ends)
-        size = [np.sqrt((part**2).sum() * len(SHARES) / NUMBERS) for part in parts]
-        return np.concatenate([np.full(len(p), np.sqrt(FAR / max(FAR, s))) for p, s in zip(parts, size, strict=True)])
+def _moved(model: AnalyticModel, chosen: Chosen, away: Array) -> AnalyticModel:
+    """A copy of the model with other coefficients."""
+    return with_values(model, chosen.names, chosen.start + away * chosen.sigma)
 
 
 def _chosen(model: AnalyticModel, free: Collection[str]) -> Chosen:
     """Coefficients of these names as their effects declare them; a search lets data decide with wider priors."""
     return choose(model, [name for name, c in model.declared_coefficients().items() if name in free and c.sigma > 0.0])
-
-
-def _until(share: float, track: Track) -> float:
-    return share * track.duration
 
 
 def fitted_to_predictions(
@@ -123,7 +66,7 @@ def fitted_to_predictions(
     Args: free: names of the coefficients; those that the model takes as exact stay.  jobs: processes.
     """
     chosen = _chosen(model, free)
-    asked = _Predictions.of(model, chosen, holdout, jobs)
+    asked = forecasts(model, chosen, holdout, jobs)
     if not chosen.names or not asked.sigmas:
         return model
     low, high = ((end - chosen.start) / chosen.sigma for end in (chosen.low, chosen.high))
@@ -148,7 +91,7 @@ def fitted_to_predictions(
             away, errors, damping = away + step, there, max(1.0, damping / 4.0)
         else:
             damping *= 4.0
-    return asked.at(away)
+    return _moved(model, chosen, away)
 
 
 def best_predicting(

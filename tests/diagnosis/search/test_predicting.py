@@ -13,9 +13,9 @@ from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.search.evaluation import errors_of
 from ballfg.diagnosis.search.predicting import (
-    _Predictions,
     best_predicting,
     fitted_to_predictions,
+    forecasts,
     told_shifts,
 )
 from ballfg.dynamics import load_model
@@ -67,7 +67,8 @@ def test_the_same_coefficients_as_by_another_solver(right):
     """Trust region with differences at each point, by scipy, of the same errors and priors."""
     holdout, model, free = right
     wrong = off(model, **{"flight.drag.k": 1.25 * value(model, "flight.drag.k")})
-    asked = _Predictions.of(wrong, choose(wrong, NAMES), holdout, 1)
+    chosen = choose(wrong, NAMES)
+    asked = forecasts(wrong, chosen, holdout, 1)
     weights = asked.weights(asked.own)
     np.testing.assert_array_equal(asked.errors([np.zeros(2)])[0], asked.own)
 
@@ -76,7 +77,7 @@ def test_the_same_coefficients_as_by_another_solver(right):
 
     other = least_squares(all_errors, np.zeros(2), diff_step=0.01, xtol=1e-4, ftol=1e-5).x
     fitted = fitted_to_predictions(wrong, free, holdout)
-    away = [(value(fitted, n) - value(wrong, n)) / free[n].sigma for n in asked.chosen.names]
+    away = [(value(fitted, n) - value(wrong, n)) / free[n].sigma for n in chosen.names]
     assert abs(away[0]) > 0.5
     np.testing.assert_allclose(away, other, atol=0.05)  # prior deviations
 

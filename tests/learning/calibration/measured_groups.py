@@ -37,7 +37,8 @@ from ballfg.learning.calibration.auto import (
     choose_candidate,
 )
 from ballfg.learning.calibration.calibrate import fitted_noise
-from ballfg.learning.calibration.problem import Problem, population_model, population_settings, pose
+from ballfg.learning.calibration.predicting import finished as finished_calibration
+from ballfg.learning.calibration.problem import Problem, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import AUTO
 from ballfg.learning.evaluation import log_density
@@ -98,12 +99,12 @@ class Halves:
 def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Settings]:
     """The model and settings of a calibration, or of a candidate without one, with the noise that the tracks show."""
     if isinstance(made, Fitted):
-        problem, last = made.problem, made.steps[-1]
-        model, settings = population_model(problem, last), population_settings(problem, last)
+        found = finished_calibration(made.problem, made.steps[-1], errors=False)
+        model, settings, noise = found.model, found.settings, found.noise
     else:
         model, settings = problem.model, problem.settings
         settings = replace(settings, coefficients={}) if made == NOMINAL else settings
-    noise = fitted_noise(problem, model, settings, errors=False)
+        noise = fitted_noise(problem, model, settings, errors=False)
     return model, settings if noise is None else noise.settings
 
 

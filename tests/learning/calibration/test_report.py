@@ -125,3 +125,11 @@ def test_errors_before_and_after_stand_side_by_side(problem: Problem) -> None:
     }.items():
         (found,) = (own for label, own in cells.items() if label.startswith(name))
         assert [float(cell) for cell in found] == [float(number) for number in numbers], name
+
+
+def test_means_that_predict_best_are_told(problem: Problem) -> None:
+    moved = step(problem).model_copy(update={"predicting": 0.0514})
+    said, words = (verdict(problem, one, compared(-0.5)) for one in (moved, step(problem)))
+    assert "The means are those that predict best, by +0.051 in the log score of fitted tracks that were left" in said
+    assert "predict best" not in words
+    assert report(problem, moved, compared(-0.5), None)["predicting_gain"] == 0.0514
