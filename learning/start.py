@@ -94,8 +94,8 @@ def calibrated_start(config: TrainConfig, folder: Path, *, resume: bool, watch: 
         choice, found = choose_candidate(problem, watch)
         print(f"the training tracks choose what the network starts from:\n{choice.table()}\n{choice.verdict()}")
         if choice.chosen not in UNLEARNED:
-            posed = found[choice.chosen].problem
-            made = finished(posed, found[choice.chosen].steps[-1], watch, errors=False)
+            one = found[choice.chosen]
+            posed, made = one.problem, finished(one.problem, one.steps[-1], watch, errors=False, made=one.predictions)
             model = made.model
             describe(model, posed, made.settings, made.noise)
         save_model(model, start.calibrated)

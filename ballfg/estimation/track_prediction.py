@@ -18,7 +18,7 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import sample_sigmas, total_sigmas
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
-from ballfg.state import POSITION, VELOCITY
+from ballfg.state import POSITION, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 from ballfg.tracks.stamps import STAMP_TOLERANCE
 
@@ -46,6 +46,8 @@ class TrackPrediction:
         estimate: from the observed part.
         conformal: the scales of the sigmas; None for the model's own sigmas.
         covariances: (k, 3, 3) m^2, of the positions, without measurement noise.
+        carried: (k, 3, p) m times their units, covariances of the positions with the p coefficients that are estimated
+            with the track, in the order of `Settings.coefficients`.
         outside: (k,) share from 0, where a network was trained, to 1 far from there; None for other models.
     """
 
@@ -58,6 +60,7 @@ class TrackPrediction:
     conformal: "ConformalScales | None" = None
     outside: Array | None = None
     covariances: Array | None = None
+    carried: Array | None = None
 
     def __repr__(self) -> str:
         return f"TrackPrediction({self.name!r}, {len(self.times)} positions, {self.status.name.lower()})"
@@ -197,6 +200,7 @@ def _predict_alike(
     belief = replace(belief, time=np.array(ends))
     positions, velocities = (np.zeros((*times.shape, 3)) for _ in range(2))
     covariances = np.zeros((*times.shape, 3, 3))
+    carried = np.zeros((*times.shape, 3, len(estimator.settings.coefficients)))
     outside: Array | None = None
     for k, predicted in enumerate(propagator.walk(belief, times) if times.size else ()):
         velocities[:, k] = predicted.mean[:, VELOCITY]
@@ -206,6 +210,7 @@ def _predict_alike(
             outside = np.zeros(times.shape) if outside is None else outside
             outside[:, k] = share
         covariances[:, k] = predicted.covariance[:, POSITION, POSITION]
+        carried[:, k] = predicted.covariance[:, POSITION, STATE_DIM:]
     for i, (track, result, (later, measured, white)) in enumerate(zip(tracks, estimates, parts, strict=True)):
         k = len(later)
         variances = np.diagonal(covariances[i, :k], axis1=1, axis2=2)
@@ -213,7 +218,7 @@ def _predict_alike(
         sigmas = np.sqrt(variances + stated**2)
         left = None if outside is None else outside[i, :k]
         ahead = later, positions[i, :k], sigmas, measured
-        yield TrackPrediction(track.name, *ahead, result, outside=left, covariances=covariances[i, :k])
+        yield TrackPrediction(track.name, *ahead, result, None, left, covariances[i, :k], carried[i, :k])
 
 
 def _padded(times: list[Array], ends: list[float]) -> Array:

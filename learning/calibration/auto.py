@@ -20,7 +20,7 @@ from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration import calibrate
 from ballfg.learning.calibration.forecasts import moments
 from ballfg.learning.calibration.groups import OWN, Groups
-from ballfg.learning.calibration.predicting import about_population, best_predicting, predicted
+from ballfg.learning.calibration.predicting import Predicted, best_predicting, predicted
 from ballfg.learning.calibration.problem import Linear, Problem, Step, judged, population_model, population_settings
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Plain, TrackScore, summary
@@ -45,10 +45,15 @@ FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candida
 
 @dataclass(frozen=True)
 class Fitted:
-    """A candidate, calibrated on all fitted tracks: its problem, without judging tracks, and all its steps."""
+    """A candidate, calibrated on all fitted tracks: its problem, without judging tracks, and all its steps.
+
+    Attributes:
+        predictions: of the fitted tracks about the last step, with the noise that they show about it.
+    """
 
     problem: Problem
     steps: tuple[Step, ...]
+    predictions: Predicted | None = None
 
 
 class Candidate(Plain):
@@ -130,7 +135,9 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice
         last = found[name].steps[-1]
         model, settings = population_model(posed, last), population_settings(posed, last)
         noise = calibrate.fitted_noise(posed, model, settings, watch, errors=False)
-        scores[name] = _folds(found[name], linear, noise, watch)
+        predictions = predicted(posed, last, settings if noise is None else noise.settings, watch)
+        found[name] = replace(found[name], predictions=predictions)
+        scores[name] = _folds(found[name], predictions, linear, noise, watch)
     return compared(scores), found
 
 
@@ -144,18 +151,18 @@ def _fitted(problem: Problem, watch: Watch) -> tuple[Fitted, Linear]:
             return Fitted(problem, tuple(steps)), linear
 
 
-def _folds(fitted: Fitted, linear: Linear, noise: NoiseEstimate | None, watch: Watch) -> tuple[TrackScore | None, ...]:
+def _folds(
+    fitted: Fitted, predictions: Predicted, linear: Linear, noise: NoiseEstimate | None, watch: Watch
+) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks' forecasts, each by the population of the other folds, with the noise of all."""
-    problem, names, last = fitted.problem, fitted.problem.split.fit, fitted.steps[-1]
-    shown = population_settings(problem, last) if noise is None else noise.settings
-    predictions = predicted(problem, last, shown, watch)
+    problem, names = fitted.problem, fitted.problem.split.fit
     made: list[tuple[AnalyticModel, Settings]] = []
     for k in range(min(FOLDS, len(names))):
         out = names[k::FOLDS]
         step = calibrate.advanced(problem, fitted.steps[-2], linear.without(out))
         step = best_predicting(step, predictions, out)
         settings = population_settings(problem, step)
-        settings = settings if noise is None else about_population(noise, settings).settings
+        settings = settings if noise is None else calibrate.about_population(noise, settings).settings
         made.append((population_model(problem, step), settings))
     return _judged(problem, made, watch)
 

@@ -166,6 +166,14 @@ def fitted_noise(
     return found if problem.correction is None else _with_doubts(found, doubt_sigmas(problem.model))
 
 
+def about_population(noise: NoiseEstimate, settings: Settings) -> NoiseEstimate:
+    """The same noise in settings with another population; spreads of coefficients keep their multiples of it."""
+    own = settings.coefficients
+    spreads = {name: noise.coefficient_factors[name] * own[name] for name in noise.noise.coefficients}
+    found = replace(noise.noise, coefficients=spreads)
+    return replace(noise, noise=found, settings=with_noise(settings, found))
+
+
 def _with_doubts(found: NoiseEstimate, doubts: dict[str, float]) -> NoiseEstimate:
     """The noise with doubts as wide as their posterior: tracks that taught the weights show less of them."""
     spreads = {name: sigma for name, sigma in found.noise.coefficients.items() if name not in doubts}

@@ -23,7 +23,7 @@ FAR: Final = 2.0  # Whitened error, root mean square, from which on a prediction
 LEAST_PREDICTED: Final = 3  # Least number of predicted samples
 
 Key = tuple[float, str]  # Observed share, name of the track
-Prediction = tuple[Array, Array]  # Errors (k, 3) and their standard deviations, m
+Prediction = tuple[Array, Array, Array]  # Errors (k, 3) and standard deviations, m; `TrackPrediction.carried`
 
 
 def moments(share: float) -> tuple[float, float, float]:
@@ -50,6 +50,7 @@ class Forecasts:
     jobs: int
     sigmas: Mapping[Key, Array]  # (k, 3) m, of each prediction where the numbers are zero
     own: Array  # (e,) whitened errors of these; NaN where the estimate fails
+    carried: Array  # (e, c) their covariances with the coefficients of the tracks, over the standard deviations
 
     @classmethod
     def of(
@@ -60,15 +61,18 @@ class Forecasts:
         shares: tuple[float, ...],
         horizon: float = np.inf,
         jobs: int = 1,
+        watch: Watch = unwatched,
     ) -> Self:
         """Of tracks with at least `LEAST_PREDICTED` samples to predict.
 
         Args: size: of the estimator's argument.  horizon: s after the last observed stamp.
         """
-        asked = cls(estimator, tuple(tracks), shares, horizon, jobs, {}, np.zeros(0))
-        made = asked._made([np.zeros(size)], unwatched)[0]
-        asked = replace(asked, sigmas={key: sigmas for key, (_, sigmas) in made.items()})
-        return replace(asked, own=asked._whitened(made))
+        nothing = np.zeros(0)
+        asked = cls(estimator, tuple(tracks), shares, horizon, jobs, {}, nothing, nothing)
+        made = asked._made([np.zeros(size)], watch)[0]
+        asked = replace(asked, sigmas={key: sigmas for key, (_, sigmas, _) in made.items()})
+        rows = [(carried / sigmas[:, :, None]).reshape(sigmas.size, -1) for _, sigmas, carried in made.values()]
+        return replace(asked, own=asked._whitened(made), carried=np.concatenate(rows or [np.zeros((0, 0))]))
 
     def errors(self, away: Sequence[Array], watch: Watch = unwatched) -> list[Array]:
         """(e,) whitened errors at each of some numbers (p,); NaN for predictions that fail there."""
@@ -110,5 +114,6 @@ def _predicted(
         for share in shares if len(track) > LEAST_PREDICTED else ():
             (one,) = predict_tracks(estimator, [track], 1, share * track.duration, horizon=horizon)
             if len(one.times) >= LEAST_PREDICTED:
-                made[share, one.name] = (one.positions - one.measured, one.sigmas)
+                assert one.carried is not None
+                made[share, one.name] = (one.positions - one.measured, one.sigmas, one.carried)
     return found

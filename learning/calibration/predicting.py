@@ -8,7 +8,7 @@ fitted beside a prior about the most probable numbers, whose precision cross-val
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Final
@@ -20,16 +20,16 @@ from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS
 from ballfg.estimation import Estimator, Settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
-from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.registry import make_estimator
-from ballfg.learning.calibration.calibrate import fitted_noise
+from ballfg.learning.calibration.calibrate import about_population, fitted_noise
+from ballfg.learning.calibration.correction import doubt_sigmas
 from ballfg.learning.calibration.forecasts import Forecasts, moments, weight
 from ballfg.learning.calibration.problem import Problem, Step, plain, population_model, population_settings
 from ballfg.learning.evaluation import log_density
 from ballfg.learning.split import tracks_of
 from ballfg.progress import Watch, unwatched
 
-DIFFERENCE: Final = 0.3  # Step of a difference, in standard errors of a number
+DIFFERENCE: Final = 0.3  # Step of a difference, in standard errors of a mean spin
 PRECISIONS: Final = (np.inf, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 """Of the prior about the most probable numbers, in what the likelihood gives them; with the first one they stay."""
 MOST_STEPS: Final = 6  # Times that predictions are weighed anew by how far they miss
@@ -61,17 +61,28 @@ class Numbers:
             found[force, :, force] = each
         return found.reshape(len(rows) * DOUBTS, len(rows) * len(FUNCTIONS))
 
-    def of_group(self, group: int) -> Index:
-        """(q,) the numbers that tracks of a group depend on: their own spins, and all the others."""
-        first, spins = len(self.coefficients), 3 * len(self.last.spins)
-        own = first + 3 * group + np.arange(3 if spins else 0)
-        doubts = first + spins + np.arange(len(self.directions))
-        return np.concatenate((np.arange(first), own, doubts))
+    @cached_property
+    def carried(self) -> list[str]:
+        """Names of those that each track has as coefficients of its own, in their order: all but the spins."""
+        doubts = doubt_sigmas(self.problem.model) if len(self.directions) else ()
+        return [name for _, name in self.problem.chosen.listed] + list(doubts)
 
     @property
-    def groups(self) -> range:
-        """Of the tracks; one without any."""
-        return range(max(1, len(self.last.spins)))
+    def of_carried(self) -> list[int]:
+        """Which numbers they are."""
+        first, doubts = len(self.coefficients), len(self.directions)
+        return [*range(first), *range(self.size - doubts, self.size)]
+
+    @property
+    def scale(self) -> Array:
+        """(c,) their standard errors."""
+        return np.concatenate((np.array(self.last.sigma)[self.coefficients], np.ones(len(self.directions))))
+
+    @property
+    def spins(self) -> list[Index]:
+        """(g,) numbers of the mean spins of all groups, along each axis."""
+        first, groups = len(self.coefficients), len(self.last.spins)
+        return [first + axis + 3 * np.arange(groups) for axis in range(3 if groups else 0)]
 
     @property
     def size(self) -> int:
@@ -193,30 +204,35 @@ class Predicted:
 def predicted(problem: Problem, last: Step, settings: Settings, watch: Watch = unwatched) -> Predicted:
     """The predictions of the fitted tracks from the `moments` of each, linearised about a step.
 
+    How a prediction follows the mean of a coefficient, its covariance with the coefficient of the track says: a mean is
+    the prior of all tracks. Spins are moved: nothing keeps the covariance with the first one.
+
     Args: settings: with the step's population, and the noise that the tracks show.
     """
-    numbers = Numbers(problem, last)
+    numbers, groups = Numbers(problem, last), problem.groups
     tracks = list(tracks_of(problem.dataset, problem.split.fit))
     shares = moments(problem.config.observed_share)
     asked = Forecasts.of(
-        partial(_estimator, numbers, settings), numbers.size, tracks, shares, problem.nearest, problem.jobs
+        partial(_estimator, numbers, settings), numbers.size, tracks, shares, problem.nearest, problem.jobs, watch
     )
-    probes = []
-    for which in np.stack([numbers.of_group(group) for group in numbers.groups], axis=1):
-        probe = np.zeros(numbers.size)
-        probe[which] = DIFFERENCE  # the spins of all groups at once: no track depends on those of two
-        probes.append(probe)
-    moved = asked.errors(probes, watch)
-    parts = [(name, part) for (_, name), part in asked.parts.items() if np.isfinite(asked.own[part]).all()]
-    slopes = np.zeros((sum(part.stop - part.start for _, part in parts), numbers.size))
-    ends, groups = [0], problem.groups
-    for name, part in parts:
-        group = 0 if groups is None else groups.names.index(groups.tracks[name])
-        ends.append(ends[-1] + part.stop - part.start)
-        for which, errors in zip(numbers.of_group(group), moved, strict=True):
-            slopes[ends[-2] : ends[-1], which] = np.nan_to_num((errors[part] - asked.own[part]) / DIFFERENCE)
-    errors = np.concatenate([np.zeros(0), *(asked.own[part] for _, part in parts)])
-    return Predicted(numbers, errors, slopes, np.array(ends), tuple(name for name, _ in parts), len(shares))
+    known = np.isfinite(asked.own)
+    slopes = np.zeros((len(asked.own), numbers.size))
+    columns = [list(settings.coefficients).index(name) for name in numbers.carried]
+    width = np.array([settings.coefficients[name] for name in numbers.carried])
+    slopes[:, numbers.of_carried] = asked.carried[:, columns] / width**2 * numbers.scale
+    spins = numbers.spins if groups is not None and len(groups.labelled) < len(tracks) else []
+    probes = np.zeros((len(spins), numbers.size))
+    for probe, axis in zip(probes, spins, strict=True):
+        probe[axis] = DIFFERENCE  # in all groups at once: no track depends on the spins of two
+    own = {name: 0 if groups is None else groups.names.index(groups.tracks[name]) for _, name in asked.parts}
+    for axis, errors in zip(spins, asked.errors([*probes], watch) if len(probes) else (), strict=True):
+        change = np.nan_to_num((errors - asked.own) / DIFFERENCE)
+        for (_, name), part in asked.parts.items():
+            slopes[part, axis[own[name]]] = change[part]
+    parts = [(name, part) for (_, name), part in asked.parts.items() if known[part].all()]
+    rows = np.concatenate([np.zeros(0, dtype=int), *(np.arange(part.start, part.stop) for _, part in parts)])
+    ends = np.cumsum([0, *(part.stop - part.start for _, part in parts)])
+    return Predicted(numbers, asked.own[rows], slopes[rows], ends, tuple(name for name, _ in parts), len(shares))
 
 
 def _estimator(numbers: Numbers, settings: Settings, away: Array) -> Estimator:
@@ -270,25 +286,19 @@ class Finished:
     noise: NoiseEstimate | None
 
 
-def finished(problem: Problem, last: Step, watch: Watch = unwatched, *, errors: bool = True) -> Finished:
+def finished(
+    problem: Problem, last: Step, watch: Watch = unwatched, *, errors: bool = True, made: Predicted | None = None
+) -> Finished:
     """What the last step of a calibration gives; one camera's predictions have no depth, and leave its means.
 
     The noise is that about the most probable means: about those that were chosen to predict, it would be too small.
 
-    Args: errors: as for `fitted_noise`.
+    Args: errors: as for `fitted_noise`.  made: the predictions about this step, where they are known.
     """
     model, settings = population_model(problem, last), population_settings(problem, last)
     noise = fitted_noise(problem, model, settings, watch, errors=errors)
     if noise is None or problem.dataset.one_view:
         return Finished(last, model, settings, noise)
-    step = best_predicting(last, predicted(problem, last, noise.settings, watch))
+    step = best_predicting(last, made or predicted(problem, last, noise.settings, watch))
     model, settings = population_model(problem, step), population_settings(problem, step)
     return Finished(step, model, settings, about_population(noise, settings))
-
-
-def about_population(noise: NoiseEstimate, settings: Settings) -> NoiseEstimate:
-    """The same noise in settings with another population; spreads of coefficients keep their multiples of it."""
-    own = settings.coefficients
-    spreads = {name: noise.coefficient_factors[name] * own[name] for name in noise.noise.coefficients}
-    found = replace(noise.noise, coefficients=spreads)
-    return replace(noise, noise=found, settings=with_noise(settings, found))

@@ -13,14 +13,13 @@ from ballfg.dynamics import load_model
 from ballfg.estimation import Settings, predict_tracks
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.registry import make_estimator
-from ballfg.learning.calibration.calibrate import calibrate, pose_correction
+from ballfg.learning.calibration.calibrate import about_population, calibrate, pose_correction
 from ballfg.learning.calibration.forecasts import FAR
 from ballfg.learning.calibration.predicting import (
     PRECISIONS,
     Finished,
     Numbers,
     Predicted,
-    about_population,
     best_predicting,
     finished,
     predicted,
