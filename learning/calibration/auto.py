@@ -39,6 +39,8 @@ in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. 
 priors and its population contain the simpler models, and it costs 0.001 in those worlds."""
 NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
+NEAR: Final = 0.3
+"""s, longest judged forecast, as for the noise (`estimate_noise`): later on, contacts decide more than the air."""
 LEAST: Final = 4  # Fitted tracks that a choice needs
 FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candidates that judge a part
 
@@ -172,7 +174,7 @@ def _judged(
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the fitted tracks' forecasts: from the config's share of each, and half-way before and after it."""
     shares = moments(problem.config.observed_share)
-    return judged(problem, made, problem.split.fit, shares, problem.nearest, watch)
+    return judged(problem, made, problem.split.fit, shares, min(NEAR, problem.horizon), watch)
 
 
 def config_of(config: CalibrationConfig, chosen: str) -> CalibrationConfig:

@@ -202,7 +202,9 @@ class Predicted:
 
 
 def predicted(problem: Problem, last: Step, settings: Settings, watch: Watch = unwatched) -> Predicted:
-    """The predictions of the fitted tracks from the `moments` of each, linearised about a step.
+    """The predictions of the fitted tracks from the `moments` of each to the config's horizon, linearised about a step.
+
+    Over the next 0.3 s alone, coefficients of bounces stand for what the air lacks, and later predictions are worse.
 
     How a prediction follows the mean of a coefficient, its covariance with the coefficient of the track says: a mean is
     the prior of all tracks. Spins are moved: nothing keeps the covariance with the first one.
@@ -213,7 +215,7 @@ def predicted(problem: Problem, last: Step, settings: Settings, watch: Watch = u
     tracks = list(tracks_of(problem.dataset, problem.split.fit))
     shares = moments(problem.config.observed_share)
     asked = Forecasts.of(
-        partial(_estimator, numbers, settings), numbers.size, tracks, shares, problem.nearest, problem.jobs, watch
+        partial(_estimator, numbers, settings), numbers.size, tracks, shares, problem.horizon, problem.jobs, watch
     )
     known = np.isfinite(asked.own)
     slopes = np.zeros((len(asked.own), numbers.size))

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field
@@ -29,10 +29,6 @@ from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.noise import TrackNoise
 
-NEAR: Final = 0.3
-"""s, longest forecast that chooses or teaches, as for the noise (`estimate_noise`): later on, contacts decide more than
-the air."""
-
 
 @dataclass(frozen=True)
 class Problem:
@@ -51,9 +47,9 @@ class Problem:
     shown: TrackNoise | None = None  # The noise that the fitted tracks are linearised with; None: the settings'
 
     @property
-    def nearest(self) -> float:
-        """s, horizon of the forecasts that choose and teach: the config's, but at most `NEAR`."""
-        return NEAR if self.config.horizon is None else min(NEAR, self.config.horizon)
+    def horizon(self) -> float:
+        """Length of the judged forecasts, s; infinite: to the end of a track."""
+        return np.inf if self.config.horizon is None else self.config.horizon
 
     @property
     def linearising(self) -> Settings:
@@ -154,9 +150,8 @@ def score(
     problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the judging tracks, in order, by a model with its settings."""
-    config = problem.config
-    horizon = np.inf if config.horizon is None else config.horizon
-    return judged(problem, [(model, settings)], problem.split.judge, (config.observed_share,), horizon, watch)
+    shares = (problem.config.observed_share,)
+    return judged(problem, [(model, settings)], problem.split.judge, shares, problem.horizon, watch)
 
 
 def judged(

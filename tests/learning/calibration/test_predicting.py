@@ -115,7 +115,7 @@ def test_slopes_are_those_of_the_predictions(windy: Calibrated, settings: Settin
     true, linear, share = list[np.ndarray](), list[np.ndarray](), problem.config.observed_share
     was, now = (
         list(
-            predict_tracks(smoother, tracks, len(tracks), lambda track: share * track.duration, horizon=problem.nearest)
+            predict_tracks(smoother, tracks, len(tracks), lambda track: share * track.duration, horizon=problem.horizon)
         )
         for smoother in smoothers
     )
