@@ -17,8 +17,8 @@ from ballfg.estimation import Settings
 from ballfg.estimation.configure import dataset_surfaces, fitted_settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.registry import make_estimator
-from ballfg.learning.calibration.auto import LEAST, NEAR, UNLEARNED, Choice, choose_candidate, compared
-from ballfg.learning.calibration.predicting import finished
+from ballfg.learning.calibration.auto import NEAR, UNLEARNED, Choice, choose_candidate, compared
+from ballfg.learning.calibration.predicting import LEAST, finished
 from ballfg.learning.calibration.problem import Problem, pose
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.training import ObserveConfig, TrainConfig

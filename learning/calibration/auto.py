@@ -20,7 +20,7 @@ from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.learning.calibration import calibrate
 from ballfg.learning.calibration.forecasts import moments
 from ballfg.learning.calibration.groups import OWN, Groups
-from ballfg.learning.calibration.predicting import Predicted, best_predicting, predicted
+from ballfg.learning.calibration.predicting import FOLDS, LEAST, Predicted, best_predicting, predicted
 from ballfg.learning.calibration.problem import Linear, Problem, Step, judged, population_model, population_settings
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import Plain, TrackScore, summary
@@ -41,8 +41,6 @@ NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
 NEAR: Final = 0.3
 """s, longest judged forecast, as for the noise (`estimate_noise`): later on, contacts decide more than the air."""
-LEAST: Final = 4  # Fitted tracks that a choice needs
-FOLDS: Final = 5  # Parts of the fitted tracks; the others calibrate the candidates that judge a part
 
 
 @dataclass(frozen=True)

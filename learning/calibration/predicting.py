@@ -33,8 +33,8 @@ DIFFERENCE: Final = 0.3  # Step of a difference, in standard errors of a mean sp
 PRECISIONS: Final = (np.inf, 1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 """Of the prior about the most probable numbers, in what the likelihood gives them; with the first one they stay."""
 MOST_STEPS: Final = 6  # Times that predictions are weighed anew by how far they miss
-FOLDS: Final = 5  # Parts of the tracks that are left out in turn
-LEAST: Final = 4  # Tracks that a choice of the precision needs
+FOLDS: Final = 5  # Parts of the fitted tracks that are left out in turn
+LEAST: Final = 4  # Fitted tracks that a choice needs
 
 
 @dataclass(frozen=True)
