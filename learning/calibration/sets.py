@@ -24,6 +24,7 @@ from ballfg.learning.calibration.calibrate import fitted_noise, with_shown_noise
 from ballfg.learning.calibration.coefficients import Chosen, with_values
 from ballfg.learning.calibration.groups import OWN
 from ballfg.learning.calibration.population import Population, evidence, fit_population
+from ballfg.learning.calibration.predicting import finished
 from ballfg.learning.calibration.problem import Problem, Step, pose, score
 from ballfg.learning.calibration.run import read_checkpoint, status_of, take_steps
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -152,7 +153,7 @@ def _calibrated(problem: Problem, place: Path, watch: Watch) -> OneSet:
     place.mkdir(exist_ok=True)
     print(f"{problem.dataset.info.name}: {len(problem.split.fit)} tracks fit, {len(problem.split.judge)} judge")
     take_steps(fitting, steps, place, watch)
-    return OneSet(problem, steps[-1])
+    return OneSet(problem, finished(fitting, steps[-1], watch, errors=False).step)
 
 
 def _judged(one: OneSet, others: Sequence[OneSet], watch: Watch) -> Pairs:

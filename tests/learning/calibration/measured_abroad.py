@@ -22,6 +22,7 @@ from ballfg.estimation import dataset_surfaces
 from ballfg.estimation.configure import fitted_settings
 from ballfg.learning.calibration.calibrate import calibrate, with_shown_noise
 from ballfg.learning.calibration.groups import OWN
+from ballfg.learning.calibration.predicting import finished
 from ballfg.learning.calibration.problem import pose
 from ballfg.learning.calibration.sets import Abroad, OneSet
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -35,7 +36,7 @@ def calibrated(halves: Halves, folder: Path) -> OneSet:
     config = CalibrationConfig(split="label", groups=OWN)
     problem = pose(dataset, nominal_model(halves.info.ball), config)
     problem = with_shown_noise(replace(problem, split=replace(problem.split, judge=())))
-    return OneSet(problem, list(calibrate(problem))[-1])
+    return OneSet(problem, finished(problem, list(calibrate(problem))[-1], errors=False).step)
 
 
 def judged(halves: Halves, others: Sequence[OneSet], folder: Path) -> None:
