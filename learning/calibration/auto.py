@@ -3,7 +3,7 @@
 All fitted tracks calibrate every candidate; then each fifth of them is judged by the population of the others, by
 forecasts from three times: one alone decides by whether a bounce lies ahead of it. Every candidate is calibrated and
 judged with the noise that the tracks show. A richer model must beat the best simpler one in the mean log score by more
-than its standard error over the tracks, calibration by any amount that someone notices; docs/train.md.
+than its standard error over the tracks; calibration is left out only where it surely gains nothing; docs/train.md.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ CANDIDATES: Final = (NOMINAL, PER_TRACK, CALIBRATED, GROUPED, CORRECTED)  # Simp
 UNLEARNED: Final = (NOMINAL, PER_TRACK)  # Without calibration: coefficients as they are, or estimated with each track
 SURELY: Final = 1.0
 """Standard errors by which a richer model must gain. Two leave out models that pay where tracks are few; one misleads
-in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. Calibration needs `NOTICED` alone: its
-priors and its population contain the simpler models, and it costs 0.001 in those worlds."""
+in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. For calibration, they are to be shown
+against it: its priors and its population contain the simpler models, and it costs 0.001 in those worlds."""
 NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
 NEAR: Final = 0.3
@@ -200,10 +200,11 @@ def compared(scores: dict[str, Sequence[TrackScore | None]]) -> Choice:
         gain, error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(count)) if count > 1 else None
         numbers = {"rmse_median": found.rmse_median, "coverage_90": found.coverage_90, "log_score": float(own.mean())}
         candidates.append(Candidate(name=name, tracks=count, gain=gain, gain_error=error, **numbers))
-        # one track alone tells nothing about others: no richer model surely gains on it
-        needed = 0.0 if name == CALIBRATED else np.inf if error is None else SURELY * error
-        if gain > max(needed, NOTICED):
-            chosen = name
+        if name == CALIBRATED:
+            better = gain + SURELY * (error or 0.0) > NOTICED
+        else:  # one track alone tells nothing about others: no richer model surely gains on it
+            better = error is not None and gain > max(SURELY * error, NOTICED)
+        chosen = name if better else chosen
     return Choice(chosen=chosen, candidates=tuple(candidates))
 
 

@@ -24,6 +24,7 @@ from ballfg.learning.calibration.auto import (
     CORRECTED,
     GROUPED,
     NOMINAL,
+    NOTICED,
     PER_TRACK,
     choose_candidate,
     compared,
@@ -253,17 +254,18 @@ def test_a_richer_model_must_surely_beat_the_best_simpler_one() -> None:
     base, noise = rng.normal(size=50), 0.1 * rng.normal(size=(4, 50))
     noise -= noise.mean(axis=1, keepdims=True)
     error = noise.std(axis=1, ddof=1) / 50**0.5
+    least = NOTICED / error[1] - 1.0  # of calibration, which goes only where it surely gains less
     for gains, right in (
-        ((0.9, 0.3, 0.9, 0.9), NOMINAL),
-        ((0.9, 0.9, 0.9, 0.9), "calibrated"),
+        ((0.9, least - 0.1, 0.9, 0.9), NOMINAL),
+        ((0.9, least + 0.1, 0.9, 0.9), "calibrated"),
         ((-9.0, 1.1, 0.9, 0.9), "calibrated"),
-        ((1.1, 1.1, 5.0, 0.9), GROUPED),
+        ((1.1, least - 0.1, 5.0, 0.9), GROUPED),
         ((1.1, -9.0, -9.0, 1.1), CORRECTED),
     ):
         logs, best = [base], base
         for gain, own, sigma in zip(gains, noise, error, strict=True):
             logs.append(best + gain * sigma + own)
-            best = logs[-1] if gain > (0.5 if len(logs) == 3 else 1.0) else best
+            best = logs[-1] if gain > (least if len(logs) == 3 else 1.0) else best
         choice = compared(dict(zip(CANDIDATES, map(scored, logs), strict=True)))
         assert choice.chosen == right
         assert len(choice.table().splitlines()) == 1 + len(CANDIDATES)
