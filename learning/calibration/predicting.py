@@ -205,9 +205,8 @@ def predicted(problem: Problem, last: Step, settings: Settings, watch: Watch = u
     """The predictions of the fitted tracks from the `moments` of each to the config's horizon, linearised about a step.
 
     Over the next 0.3 s alone, coefficients of bounces stand for what the air lacks, and later predictions are worse.
-
-    How a prediction follows the mean of a coefficient, its covariance with the coefficient of the track says: a mean is
-    the prior of all tracks. Spins are moved: nothing keeps the covariance with the first one.
+    How a prediction follows the mean of a coefficient is told by its covariance with the track's own, whose prior the
+    mean is. Mean spins are moved to see it: no covariance with the first spin is kept.
 
     Args: settings: with the step's population, and the noise that the tracks show.
     """
@@ -221,7 +220,8 @@ def predicted(problem: Problem, last: Step, settings: Settings, watch: Watch = u
     slopes = np.zeros((len(asked.own), numbers.size))
     columns = [list(settings.coefficients).index(name) for name in numbers.carried]
     width = np.array([settings.coefficients[name] for name in numbers.carried])
-    slopes[:, numbers.of_carried] = asked.carried[:, columns] / width**2 * numbers.scale
+    if len(slopes):
+        slopes[:, numbers.of_carried] = asked.carried[:, columns] / width**2 * numbers.scale
     spins = numbers.spins if groups is not None and len(groups.labelled) < len(tracks) else []
     probes = np.zeros((len(spins), numbers.size))
     for probe, axis in zip(probes, spins, strict=True):

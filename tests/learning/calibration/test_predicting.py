@@ -100,6 +100,13 @@ def test_three_tracks_choose_nothing(windy: Calibrated) -> None:
     assert finished(few, last, errors=False).step is last
 
 
+def test_without_predictions_the_means_stay(windy: Calibrated, settings: Settings) -> None:
+    problem, last = windy
+    none = predicted(replace(problem, split=replace(problem.split, fit=())), last, settings)
+    assert none.slopes.shape == (0, 5)
+    assert best_predicting(last, none) is last
+
+
 def test_slopes_are_those_of_the_predictions(windy: Calibrated, settings: Settings, made: Predicted) -> None:
     """Of all numbers moved together, by predictions of the moved model itself."""
     problem, _ = windy
