@@ -82,7 +82,7 @@ def compared(problem: Problem, truth: AnalyticModel, corrected: Fitted, chosen: 
     known = replace(problem, model=truth, settings=replace(problem.settings, coefficients={}))
     model, settings = finished(problem, corrected)
     best = finished(known, NOMINAL), (model, settings), finished(problem, chosen)
-    right, *others = (np.nanmedian(errors(problem, *one, judge)[:, 0]) for one in best)
+    right, *others = (np.nanmedian(errors(problem.surfaces, *one, judge)[:, 0]) for one in best)
     smoother = make_estimator("smoother", model, problem.surfaces, settings)
     states = np.concatenate([one.states for one in estimate_tracks(smoother, judge, len(judge), 1)])
     shares = (inside(model, truth, force, states) for force in ("drag", "lift"))
