@@ -130,8 +130,11 @@ class Numbers:
         sigma[k] = own
         parts = zip(step.spins, self.last.spins, _threes(away[first:last]), _threes(factor[first:last]), strict=True)
         spins = tuple(there.moved(shift * np.array(here.sigma), more) for there, here, shift, more in parts)
+        doubts = np.array(step.doubts).reshape(-1, len(FUNCTIONS), len(FUNCTIONS))
+        doubts[:, :DOUBTS] *= factor[last:].reshape(-1, DOUBTS, 1)
         return step.model_copy(
             update={
+                "doubts": tuple(plain(row) for row in doubts.reshape(-1, len(FUNCTIONS))),
                 "mean": plain(np.clip(mean + shift, chosen.low, chosen.high)),
                 "sigma": plain(sigma),
                 "next_track": plain(wide),

@@ -190,6 +190,12 @@ def test_numbers_move_a_step_and_are_read_from_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         np.subtract(spin.mean, end.spins[0].mean), np.array([1.0, -2.0, 0.5]) * end.spins[0].sigma, rtol=1e-9
     )
+    np.testing.assert_array_equal(moved.doubts, end.doubts)
+    wider = numbers.moved(end, np.zeros(8), np.array([2.0, 3.0, 1.0, 1.0, 4.0, 1.0, 1.0, 5.0]))
+    assert wider.sigma[0] == pytest.approx(2.0 * end.sigma[0])
+    assert wider.spins[0].sigma == pytest.approx(np.array([3.0, 1.0, 1.0]) * end.spins[0].sigma)
+    scale = np.array([4.0, 1.0, 1.0, 5.0, *np.ones(7)])[:, None]
+    np.testing.assert_allclose(wider.doubts, scale * np.array(end.doubts))
     far = numbers.moved(end, np.concatenate(([1e6], np.zeros(7))))
     assert far.mean[0] == corrected.chosen.high[0]
     low, high = numbers.bounds()
