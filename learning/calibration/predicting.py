@@ -17,10 +17,12 @@ import numpy as np
 
 from ballfg.arrays import Array, Index, Mask
 from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics.effects.generic import DOUBTS, FUNCTIONS
 from ballfg.estimation import Estimator, Settings
 from ballfg.estimation.noise.estimate import NoiseEstimate
 from ballfg.estimation.registry import make_estimator
 from ballfg.learning.calibration.calibrate import about_population, fitted_noise
+from ballfg.learning.calibration.correction import doubt_sigmas
 from ballfg.learning.calibration.forecasts import Forecasts, moments, weight
 from ballfg.learning.calibration.problem import Problem, Step, plain, population_model, population_settings
 from ballfg.learning.evaluation import log_density
@@ -37,10 +39,9 @@ LEAST: Final = 4  # Fitted tracks that a choice needs
 
 @dataclass(frozen=True)
 class Numbers:
-    """The p numbers that are moved, in standard errors: coefficients that differ between tracks, then spins of groups.
+    """The p numbers that are moved, in standard errors: first coefficients, then spins of groups, then doubts.
 
-    A coefficient that differs between groups moves in all of them alike. The weights of a correction stay: they would
-    take on what bounces lack, and the curve would leave its band.
+    A coefficient that differs between groups moves in all of them alike. Doubts stand for the weights of a correction.
     """
 
     problem: Problem
@@ -51,6 +52,32 @@ class Numbers:
         """Which of the chosen coefficients they are."""
         return [k for k, _ in self.problem.chosen.listed]
 
+    @cached_property
+    def directions(self) -> Array:
+        """(d, w) one standard error of each doubt, in all weights of the correction."""
+        rows = np.array(self.last.doubts).reshape(-1, len(FUNCTIONS), len(FUNCTIONS))[:, :DOUBTS]
+        found = np.zeros((len(rows), DOUBTS, len(rows), len(FUNCTIONS)))
+        for force, each in enumerate(rows):
+            found[force, :, force] = each
+        return found.reshape(len(rows) * DOUBTS, len(rows) * len(FUNCTIONS))
+
+    @cached_property
+    def carried(self) -> list[str]:
+        """Names of those that each track has as coefficients of its own, in their order: all but the spins."""
+        doubts = doubt_sigmas(self.problem.model) if len(self.directions) else ()
+        return [name for _, name in self.problem.chosen.listed] + list(doubts)
+
+    @property
+    def of_carried(self) -> list[int]:
+        """Which numbers they are."""
+        first, doubts = len(self.coefficients), len(self.directions)
+        return [*range(first), *range(self.size - doubts, self.size)]
+
+    @property
+    def scale(self) -> Array:
+        """(c,) their standard errors."""
+        return np.concatenate((np.array(self.last.sigma)[self.coefficients], np.ones(len(self.directions))))
+
     @property
     def spins(self) -> list[Index]:
         """(g,) numbers of the mean spins of all groups, along each axis."""
@@ -60,7 +87,7 @@ class Numbers:
     @property
     def size(self) -> int:
         """How many they are."""
-        return len(self.coefficients) + 3 * len(self.last.spins)
+        return len(self.coefficients) + 3 * len(self.last.spins) + len(self.directions)
 
     def bounds(self) -> tuple[Array, Array]:
         """(p,) each."""
@@ -73,23 +100,26 @@ class Numbers:
         )
 
     def between(self, step: Step) -> Array:
-        """(p,) those of another step."""
-        last, k = self.last, self.coefficients
-        mean = (np.array(step.mean) - np.array(last.mean))[k] / np.array(last.sigma)[k]
+        """(p,) those of another step; of its weights, what the doubts can say."""
+        last, k, alike = self.last, self.coefficients, self.problem.chosen.alike
+        mean = np.array(step.mean) - np.array(last.mean)
         spins = [
             (np.array(there.mean) - np.array(here.mean)) / np.array(here.sigma)
             for here, there in zip(last.spins, step.spins, strict=True)
         ]
-        return np.concatenate((mean, *spins))
+        weights = np.linalg.lstsq(self.directions.T, mean[alike], rcond=None)[0] if len(alike) else np.zeros(0)
+        return np.concatenate((mean[k] / np.array(last.sigma)[k], *spins, weights))
 
     def moved(self, step: Step, away: Array, factor: Array | None = None) -> Step:
         """A step with numbers that are moved by some (p,), and standard errors times some factors (p,)."""
         chosen, k = self.problem.chosen, self.coefficients
-        first = len(k)
+        first, last = len(k), len(k) + 3 * len(step.spins)
         factor = np.ones(self.size) if factor is None else factor
         mean, sigma, wide = np.array(step.mean), np.array(step.sigma), np.array(step.next_track)
         shift = np.zeros(len(mean))
         shift[k] = away[:first] * np.array(self.last.sigma)[k]
+        if len(chosen.alike):
+            shift[chosen.alike] = away[last:] @ self.directions
         by_group = {
             name: plain(np.clip(np.array(values) + shift[n], chosen.low[n], chosen.high[n]))
             for name, values in step.by_group.items()
@@ -98,10 +128,13 @@ class Numbers:
         own = sigma[k] * factor[:first]
         wide[k] = np.sqrt(np.maximum(wide[k] ** 2 - sigma[k] ** 2, 0.0) + own**2)
         sigma[k] = own
-        parts = zip(step.spins, self.last.spins, _threes(away[first:]), _threes(factor[first:]), strict=True)
+        parts = zip(step.spins, self.last.spins, _threes(away[first:last]), _threes(factor[first:last]), strict=True)
         spins = tuple(there.moved(shift * np.array(here.sigma), more) for there, here, shift, more in parts)
+        doubts = np.array(step.doubts).reshape(-1, len(FUNCTIONS), len(FUNCTIONS))
+        doubts[:, :DOUBTS] *= factor[last:].reshape(-1, DOUBTS, 1)
         return step.model_copy(
             update={
+                "doubts": tuple(plain(row) for row in doubts.reshape(-1, len(FUNCTIONS))),
                 "mean": plain(np.clip(mean + shift, chosen.low, chosen.high)),
                 "sigma": plain(sigma),
                 "next_track": plain(wide),
@@ -188,12 +221,10 @@ def predicted(problem: Problem, last: Step, settings: Settings, watch: Watch = u
     )
     known = np.isfinite(asked.own)
     slopes = np.zeros((len(asked.own), numbers.size))
-    names = [problem.chosen.names[k] for k in numbers.coefficients]
-    columns = [list(settings.coefficients).index(name) for name in names]
-    width = np.array([settings.coefficients[name] for name in names])
+    columns = [list(settings.coefficients).index(name) for name in numbers.carried]
+    width = np.array([settings.coefficients[name] for name in numbers.carried])
     if len(slopes):
-        scale = np.array(last.sigma)[numbers.coefficients] / width**2
-        slopes[:, : len(names)] = asked.carried[:, columns] * scale
+        slopes[:, numbers.of_carried] = asked.carried[:, columns] / width**2 * numbers.scale
     spins = numbers.spins if groups is not None and len(groups.labelled) < len(tracks) else []
     probes = np.zeros((len(spins), numbers.size))
     for probe, axis in zip(probes, spins, strict=True):

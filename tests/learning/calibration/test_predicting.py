@@ -175,26 +175,28 @@ def test_the_covariance_is_that_of_tracks_left_out(made: Predicted) -> None:
 
 
 def test_numbers_move_a_step_and_are_read_from_it(tmp_path: Path) -> None:
-    """Of coefficients and spins, with bounds; the weights of a correction and their doubts stay."""
+    """Of coefficients, spins and a correction, with bounds."""
     problem = posed(tmp_path, SLOPE, 12)
     *_, last = calibrate(problem)
     corrected = pose_correction(problem, last)
     *_, end = calibrate(corrected)
     numbers = Numbers(corrected, end)
-    assert numbers.size == 1 + 3
-    away = np.array([0.3, 1.0, -2.0, 0.5])
+    assert numbers.size == 1 + 3 + 4
+    away = np.array([0.3, 1.0, -2.0, 0.5, 0.2, -0.7, 1.5, -0.1])
     moved = numbers.moved(end, away)
     np.testing.assert_allclose(numbers.between(moved), away, atol=1e-6)
     assert moved.sigma == pytest.approx(end.sigma)
-    assert (moved.mean[1:], moved.doubts) == (end.mean[1:], end.doubts)
     spin = moved.spins[0]
     np.testing.assert_allclose(
         np.subtract(spin.mean, end.spins[0].mean), np.array([1.0, -2.0, 0.5]) * end.spins[0].sigma, rtol=1e-9
     )
-    wider = numbers.moved(end, np.zeros(4), np.array([2.0, 3.0, 1.0, 1.0]))
+    np.testing.assert_array_equal(moved.doubts, end.doubts)
+    wider = numbers.moved(end, np.zeros(8), np.array([2.0, 3.0, 1.0, 1.0, 4.0, 1.0, 1.0, 5.0]))
     assert wider.sigma[0] == pytest.approx(2.0 * end.sigma[0])
     assert wider.spins[0].sigma == pytest.approx(np.array([3.0, 1.0, 1.0]) * end.spins[0].sigma)
-    far = numbers.moved(end, np.array([1e6, 0.0, 0.0, 0.0]))
+    scale = np.array([4.0, 1.0, 1.0, 5.0, *np.ones(7)])[:, None]
+    np.testing.assert_allclose(wider.doubts, scale * np.array(end.doubts))
+    far = numbers.moved(end, np.concatenate(([1e6], np.zeros(7))))
     assert far.mean[0] == corrected.chosen.high[0]
     low, high = numbers.bounds()
     assert low[0] < 0.0 < high[0]
