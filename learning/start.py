@@ -95,7 +95,7 @@ def calibrated_start(config: TrainConfig, folder: Path, *, resume: bool, watch: 
         print(f"the training tracks choose what the network starts from:\n{choice.table()}\n{choice.verdict()}")
         if choice.chosen not in UNLEARNED:
             one = found[choice.chosen]
-            posed, made = one.problem, finished(one.problem, one.steps[-1], watch, errors=False, made=one.predictions)
+            posed, made = one.problem, finished(one.problem, one.steps[-1], watch, errors=False)
             model = made.model
             describe(model, posed, made.settings, made.noise)
         save_model(model, start.calibrated)

@@ -35,7 +35,7 @@ CANDIDATES: Final = (NOMINAL, PER_TRACK, CALIBRATED, GROUPED, CORRECTED)  # Simp
 UNLEARNED: Final = (NOMINAL, PER_TRACK)  # Without calibration: coefficients as they are, or estimated with each track
 SURELY: Final = 1.0
 """Standard errors by which a richer model must gain. Two leave out models that pay where tracks are few; one misleads
-in none of forty nominal worlds, where no candidate gains as much as `NOTICED`. For calibration, they are to be shown
+in one of forty nominal worlds, where a correction gains just `NOTICED`. For calibration, they are to be shown
 against it: its priors and its population contain the simpler models, and it costs 0.001 in those worlds."""
 NOTICED: Final = 0.005
 """Least gain in the mean log density of a coordinate: half a per cent, which no user of a prediction notices."""
@@ -45,15 +45,10 @@ NEAR: Final = 0.3
 
 @dataclass(frozen=True)
 class Fitted:
-    """A candidate, calibrated on all fitted tracks: its problem, without judging tracks, and all its steps.
-
-    Attributes:
-        predictions: of the fitted tracks about the last step, with the noise that they show about it.
-    """
+    """A candidate, calibrated on all fitted tracks: its problem, without judging tracks, and all its steps."""
 
     problem: Problem
     steps: tuple[Step, ...]
-    predictions: Predicted | None = None
 
 
 class Candidate(Plain):
@@ -136,7 +131,6 @@ def choose_candidate(problem: Problem, watch: Watch = unwatched) -> tuple[Choice
         model, settings = population_model(posed, last), population_settings(posed, last)
         noise = calibrate.fitted_noise(posed, model, settings, watch, errors=False)
         predictions = predicted(posed, last, settings if noise is None else noise.settings, watch)
-        found[name] = replace(found[name], predictions=predictions)
         scores[name] = _folds(found[name], predictions, linear, noise, watch)
     return compared(scores), found
 

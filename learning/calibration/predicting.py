@@ -291,19 +291,17 @@ class Finished:
     noise: NoiseEstimate | None
 
 
-def finished(
-    problem: Problem, last: Step, watch: Watch = unwatched, *, errors: bool = True, made: Predicted | None = None
-) -> Finished:
+def finished(problem: Problem, last: Step, watch: Watch = unwatched, *, errors: bool = True) -> Finished:
     """What the last step of a calibration gives; one camera's predictions have no depth, and leave its means.
 
     The noise is that about the most probable means: about those that were chosen to predict, it would be too small.
 
-    Args: errors: as for `fitted_noise`.  made: the predictions about this step, where they are known.
+    Args: errors: as for `fitted_noise`.
     """
     model, settings = population_model(problem, last), population_settings(problem, last)
     noise = fitted_noise(problem, model, settings, watch, errors=errors)
     if noise is None or problem.dataset.one_view:
         return Finished(last, model, settings, noise)
-    step = best_predicting(last, made or predicted(problem, last, noise.settings, watch))
+    step = best_predicting(last, predicted(problem, last, noise.settings, watch))
     model, settings = population_model(problem, step), population_settings(problem, step)
     return Finished(step, model, settings, about_population(noise, settings))

@@ -35,7 +35,7 @@ from ballfg.learning.calibration.calibrate import (
     with_shown_noise,
 )
 from ballfg.learning.calibration.picture import draw
-from ballfg.learning.calibration.predicting import Predicted, finished
+from ballfg.learning.calibration.predicting import finished
 from ballfg.learning.calibration.problem import Problem, Step, pose, score
 from ballfg.learning.calibration.report import compare, outcome, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -81,7 +81,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         fit, judge = len(problem.split.fit), len(problem.split.judge)
         print(f"{folder / files.CONFIG}: the config; {fit} tracks fit, {judge} judge")
         found: dict[str, Fitted] = {}
-        finish = partial(_finish, folder=folder, watch=watch, proven=config.kind == AUTO, predictions=None)
+        finish = partial(_finish, folder=folder, watch=watch, proven=config.kind == AUTO)
         if config.kind == AUTO:
             chosen, found = _chosen(problem, folder, resume, watch)
             if chosen in UNLEARNED:
@@ -93,7 +93,6 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         last: Problem | None = None
         if found:
             problem, last, steps = _resumed(found, chosen, problem, watch)
-            finish = partial(finish, predictions=found[chosen].predictions)
             write_checkpoint(folder, problem, *steps)
         else:
             steps = read_checkpoint(folder, problem) if resume else steps
@@ -189,14 +188,12 @@ def status_of(word: str, *, proven: bool) -> int:
     return 0 if word == "better" or (proven and word != "worse") else NOT_BETTER
 
 
-def _finish(
-    problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch, proven: bool, predictions: Predicted | None
-) -> int:
+def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch, proven: bool) -> int:
     """Judge once more with the spread as the prior and with the noise, write the results and print their paths.
 
-    Returns: the exit status. Args: proven: as of `status_of`.  predictions: about the last step, if they are known.
+    Returns: the exit status. Args: proven: as of `status_of`.
     """
-    made = finished(problem, steps[-1], watch, made=predictions)
+    made = finished(problem, steps[-1], watch)
     model, population, noise = made.model, made.settings, made.noise
     last = made.step if made.step is steps[-1] else with_scores(problem, made.step, watch)
     spread = score(problem, model, population, watch)

@@ -99,7 +99,7 @@ class Halves:
 def finished(problem: Problem, made: Fitted | str) -> tuple[AnalyticModel, Settings]:
     """The model and settings of a calibration, or of a candidate without one, with the noise that the tracks show."""
     if isinstance(made, Fitted):
-        found = finished_calibration(made.problem, made.steps[-1], errors=False, made=made.predictions)
+        found = finished_calibration(made.problem, made.steps[-1], errors=False)
         model, settings, noise = found.model, found.settings, found.noise
     else:
         model, settings = problem.model, problem.settings

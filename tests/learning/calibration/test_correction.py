@@ -230,6 +230,15 @@ def test_a_run_writes_the_correction_and_continues(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "model.yaml").read_bytes() == first
 
 
+def test_a_resumed_choice_comes_to_the_same_model(tmp_path: Path) -> None:
+    """The candidates that were just compared leave nothing that a later run lacks."""
+    config = posed(tmp_path, SLOPE, 24).config.model_copy(update={"kind": "auto", "groups": None})
+    run_calibration(config, tmp_path / "out", resume=False, jobs=1, watch=unwatched)
+    first = [(tmp_path / "out" / name).read_bytes() for name in ("model.yaml", "report.json")]
+    run_calibration(config, tmp_path / "out", resume=True, jobs=1, watch=unwatched)
+    assert [(tmp_path / "out" / name).read_bytes() for name in ("model.yaml", "report.json")] == first
+
+
 def test_a_second_correction_is_refused() -> None:
     model = AnalyticModel([Gravity(), Drag(), Magnus(), AirCorrection()])
     set_doubts(model, [[0.1] * len(FUNCTIONS)] * 2 * len(FUNCTIONS))
@@ -258,7 +267,9 @@ def test_a_richer_model_must_surely_beat_the_best_simpler_one() -> None:
     for gains, right in (
         ((0.9, least - 0.1, 0.9, 0.9), NOMINAL),
         ((0.9, least + 0.1, 0.9, 0.9), "calibrated"),
+        ((0.9, 0.9, 0.9, 0.9), "calibrated"),
         ((-9.0, 1.1, 0.9, 0.9), "calibrated"),
+        ((1.1, 1.1, 5.0, 0.9), GROUPED),
         ((1.1, least - 0.1, 5.0, 0.9), GROUPED),
         ((1.1, -9.0, -9.0, 1.1), CORRECTED),
     ):
