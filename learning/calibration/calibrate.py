@@ -83,7 +83,7 @@ def pose_correction(
     corrected, terms = with_correction(model, watch(estimates, len(names), "tracks estimated"), labelled=labelled)
     corrected.variations = dict(problem.model.variations)  # those of groups are found anew
     chosen = with_weights(corrected, problem.chosen, labelled=labelled)
-    mean = np.concatenate((last.mean, np.zeros(len(chosen.shared))))
+    mean = np.concatenate((last.mean, chosen.start[len(last.mean) :]))
     config = problem.config.model_copy(update={"tolerance": max(problem.config.tolerance, ROUGHLY)})
     begun = Correction(mean, last.spins, terms)
     posed = replace(problem, model=corrected, chosen=chosen, config=config, correction=begun)

@@ -1,6 +1,7 @@
-"""Learns a correction of drag and lift after a calibration: further coefficients of the same population.
+"""Learns a correction of drag, lift and restitution after a calibration: further coefficients of the same population.
 
 The weights of the effect `air_correction` are shared by all tracks; their prior's width is the one of largest evidence.
+The restitution has a slope over the impact's speed: without it, what later bounces lack would be the air's to explain.
 The calibrated model and its spins are where the iteration begins.
 """
 
@@ -15,6 +16,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.effects.bounce import Restitution, RestitutionSpeed
 from ballfg.dynamics.effects.generic import (
     DOUBT,
     DOUBTS,
@@ -27,13 +29,16 @@ from ballfg.dynamics.effects.generic import (
 from ballfg.estimation import Estimate, Status
 from ballfg.learning.calibration.coefficients import Chosen, choose, values_of
 from ballfg.learning.calibration.groups import GroupSpin
-from ballfg.state import SPIN, VELOCITY
+from ballfg.state import SPIN, VELOCITY, VZ
 
 SECTION: Final = f"flight.{AirCorrection.name}"
 DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))  # Names of the weights of drag
 ALL: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS)
 """With those of lift, which tracks without spin labels cannot tell from another spin."""
 SCALE: Final = "flight.drag.k"
+RESTITUTION: Final = f"bounce.{Restitution.name}.e"
+SLOPE: Final = f"bounce.{RestitutionSpeed.name}.slope"
+STEEP: Final = 0.01  # s/m. Prior standard deviation of the slope: some per cent of restitution between impacts
 HELD: Final = 0.1  # Prior standard deviation of the mean drag beside a correction, as a share of the usual one
 LINEAR: Final = 0.1
 """Standard deviation of each weight in one track, about the mean at which it is linearised; it is removed again."""
@@ -82,6 +87,8 @@ def with_correction(
 ) -> tuple[AnalyticModel, Array]:
     """A copy of the model with a correction of zero, whose functions span the samples of some estimates.
 
+    Where these bounce, a restitution gets a slope of zero about the median impact, if the model has none yet.
+
     Args: labelled: as for `with_weights`; without it, lift has no doubts.
     Returns: the model, and `Correction.terms`.
     Raises: ValueError: if the model has a correction or no drag or Magnus force, or no estimate converged.
@@ -106,6 +113,12 @@ def with_correction(
     carried = [f"{DOUBT[force]}_{k}" for force in FORCES[: 1 + labelled] for k in range(1, DOUBTS + 1)]
     effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR), **dict.fromkeys(carried, 1.0))
     effects = [*copy.deepcopy(model.effects), effect]
+    falls = -np.array([one.states[contact.interval, VZ] for one in found for contact in one.contacts])
+    falls = falls[falls > 0.0]
+    if len(falls) and Restitution.name in model.bounce and RestitutionSpeed.name not in model.bounce:
+        slope = RestitutionSpeed(slope=0.0, reference=float(np.median(falls)))
+        slope.set_sigmas(slope=STEEP)
+        effects.append(slope)
     corrected = AnalyticModel(effects, radius=model.radius, inertia_factor=model.inertia_factor)
     return corrected, terms.T @ terms / len(terms)
 
@@ -168,14 +181,15 @@ def doubt_sigmas(model: AnalyticModel) -> dict[str, float]:
 
 
 def with_weights(model: AnalyticModel, chosen: Chosen, *, labelled: bool) -> Chosen:
-    """The chosen coefficients, with their priors, and weights of the model's correction.
+    """The chosen coefficients, with their priors, the slope of the restitution, and weights of the model's correction.
 
     Drag is held near its calibrated value: a larger one and a larger correction are the same.
 
     Args: labelled: True if tracks have spin labels, which tell a larger lift from a larger spin.
     """
     shared = ALL if labelled else DRAG
-    further = choose(model, shared)
+    slope = [SLOPE] if SLOPE in model.declared_coefficients() and SLOPE not in chosen.names else []
+    further = choose(model, (*slope, *shared))
     if SCALE in chosen.names:
         k, start, sigma = chosen.names.index(SCALE), chosen.start.copy(), chosen.sigma.copy()
         start[k], sigma[k] = values_of(model, [SCALE])[0], HELD * sigma[k]

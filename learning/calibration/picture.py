@@ -11,10 +11,11 @@ from matplotlib.axes import Axes
 from ballfg.checks import drawn
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.effects.bounce import RestitutionSpeed
 from ballfg.dynamics.effects.generic import FUNCTIONS, AirCorrection
 from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.files.whole_file import whole_file
-from ballfg.learning.calibration.correction import learned, spans
+from ballfg.learning.calibration.correction import RESTITUTION, SLOPE, learned, spans
 from ballfg.learning.calibration.problem import Problem, Step, population_model
 from ballfg.learning.calibration.report import Comparison
 
@@ -30,7 +31,8 @@ def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> No
     """Write the picture as a PNG file."""
     listed = problem.chosen.listed
     curves = [] if problem.correction is None else _curves(population_model(problem, last))
-    panels = len(listed) + len(curves) + 1
+    bounces = problem.correction is not None and {SLOPE, RESTITUTION} <= set(problem.chosen.names)
+    panels = len(listed) + len(curves) + bounces + 1
     columns = min(panels, 4)
     rows = -(-panels // columns)
     figure, grid = plt.subplots(rows, columns, figsize=(4.0 * columns, 3.9 * rows), layout="constrained", squeeze=False)
@@ -39,6 +41,8 @@ def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> No
         _coefficient(axes[place], problem, last, k)
     for place, curve in enumerate(curves, start=len(listed)):
         _correction(axes[place], *curve)
+    if bounces:
+        _restitution(axes[panels - 2], problem, last)
     _errors(axes[panels - 1], comparison)
     for unused in axes[panels:]:
         unused.set_axis_off()
@@ -88,6 +92,23 @@ def _correction(axes: Axes, model: AnalyticModel, force: str, along: str) -> Non
     words, _, unit = AXES[other].partition(", ")
     axes.set_title(f"{force} where the {words} is {middle[other][0]:.3g} {unit}".rstrip(), size=10)
     axes.set(xlabel=AXES[along], ylabel=f"correction of {force}, %")
+    axes.grid(visible=True, alpha=0.25)
+    axes.legend(fontsize="x-small")
+
+
+def _restitution(axes: Axes, problem: Problem, last: Step) -> None:
+    """The learned restitution against the normal speed of an impact; its error at the median one is none of the slope's."""
+    middle = cast(Effect, problem.model.bounce[RestitutionSpeed.name]).values()["reference"]
+    speed = np.linspace(0.5 * middle, 1.5 * middle, CURVE)
+    (e, e_sigma), (slope, slope_sigma) = (
+        (last.mean[k], last.sigma[k]) for k in map(problem.chosen.names.index, (RESTITUTION, SLOPE))
+    )
+    mean, sigma = e - slope * (speed - middle), np.hypot(e_sigma, slope_sigma * (speed - middle))
+    axes.axvline(middle, color=START, alpha=0.5, linewidth=1.0, label="median impact")
+    axes.fill_between(speed, mean - NINETY * sigma, mean + NINETY * sigma, color=BAND, alpha=0.25, linewidth=0)
+    axes.plot(speed, mean, color=BAND, linewidth=1.5, label="learned, with its 90 % band")
+    axes.set(xlabel="normal speed of the impact, m/s", ylabel="restitution")
+    axes.set_title("restitution against speed", size=10)
     axes.grid(visible=True, alpha=0.25)
     axes.legend(fontsize="x-small")
 

@@ -4,7 +4,8 @@ Where a model is right, the likelihood of the tracks says all about its numbers.
 probable numbers describe short motion best, and predictions drift to one side. Those that predict best are found by a
 prediction error method [M. Farina, L. Piroddi, Simulation error minimization and multi-step prediction error methods,
 2011]. Which of both to follow is for tracks to say that had no part in either: the predictions, linearised once, are
-fitted beside a prior about the most probable numbers, whose precision cross-validation over the tracks chooses.
+fitted beside a prior about the most probable numbers, whose precision cross-validation over the tracks chooses; as far
+as the likelihood gave it: what a model states of its coefficients holds in full.
 """
 
 from collections.abc import Collection, Sequence
@@ -88,6 +89,14 @@ class Numbers:
     def size(self) -> int:
         """How many they are."""
         return len(self.coefficients) + 3 * len(self.last.spins) + len(self.directions)
+
+    def prior(self, precision: float) -> Array:
+        """(p,) precisions about the most probable numbers, with some share of what the likelihood gives them."""
+        known = self.problem.model.declared_coefficients()
+        stated = np.array([known[name].sigma for _, name in self.problem.chosen.listed])
+        held = np.zeros(self.size)
+        held[: len(stated)] = np.minimum(np.array(self.last.sigma)[self.coefficients] / stated, 1.0) ** 2
+        return held + precision * (1.0 - held)
 
     def bounds(self) -> tuple[Array, Array]:
         """(p,) each."""
@@ -178,11 +187,13 @@ class Predicted:
 
     def fitted(self, precision: float, about: Array, kept: Mask) -> Array:
         """(p,) the numbers that predict best beside a prior about some. Args: kept: (n,) predictions that count."""
-        away, (low, high) = about, self.numbers.bounds()
-        for _ in range(MOST_STEPS if np.isfinite(precision) else 0):
+        if not np.isfinite(precision):
+            return about
+        away, prior, (low, high) = about, self.numbers.prior(precision), self.numbers.bounds()
+        for _ in range(MOST_STEPS):
             sums = self.weighed(away, kept).sum(axis=0)
-            own = sums[:-1, :-1] + precision * np.eye(len(about))
-            away = np.clip(np.linalg.solve(own, precision * about - sums[:-1, -1]), low, high)
+            own = sums[:-1, :-1] + np.diag(prior)
+            away = np.clip(np.linalg.solve(own, prior * about - sums[:-1, -1]), low, high)
         return away
 
     def scores(self, away: Array, kept: Mask) -> dict[str, float]:
@@ -200,8 +211,9 @@ class Predicted:
         pulls = weighed[:, :-1, :-1] @ away + weighed[:, :-1, -1]
         names = sorted(set(self.tracks))
         of_track = np.array([pulls[[one == name for one in self.tracks]].sum(axis=0) for name in names])
-        inverse = np.linalg.inv(weighed[:, :-1, :-1].sum(axis=0) + precision * np.eye(len(away)))
-        return np.asarray(inverse @ (of_track.T @ of_track + precision**2 * np.eye(len(away))) @ inverse)
+        prior = np.diag(self.numbers.prior(precision))
+        inverse = np.linalg.inv(weighed[:, :-1, :-1].sum(axis=0) + prior)
+        return np.asarray(inverse @ (of_track.T @ of_track + prior**2) @ inverse)
 
 
 def predicted(problem: Problem, last: Step, settings: Settings, watch: Watch = unwatched) -> Predicted:

@@ -45,6 +45,7 @@ from ballfg.learning.calibration.correction import (
 from ballfg.learning.calibration.groups import WIDTHS, _widest
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.population import Evidence
+from ballfg.learning.calibration.predicting import finished
 from ballfg.learning.calibration.problem import Problem, Step, population_model, population_settings, pose, score
 from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import run_calibration
@@ -52,6 +53,7 @@ from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.config_file import checked_config
 from ballfg.learning.evaluation import TrackScore, log_density, summary
 from ballfg.progress import unwatched
+from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from ballfg.tracks import TABLE_TENNIS, Track, read_dataset, write_dataset
 from ballfg.tracks.info import DatasetInfo
 
@@ -237,6 +239,27 @@ def test_a_resumed_choice_comes_to_the_same_model(tmp_path: Path) -> None:
     first = [(tmp_path / "out" / name).read_bytes() for name in ("model.yaml", "report.json")]
     run_calibration(config, tmp_path / "out", resume=True, jobs=1, watch=unwatched)
     assert [(tmp_path / "out" / name).read_bytes() for name in ("model.yaml", "report.json")] == first
+
+
+def test_a_restitution_that_falls_with_speed_is_not_the_airs(tmp_path: Path) -> None:
+    """Its slope comes back, and drag is as declared."""
+    slope = 0.025
+    hidden = parse_effects([f"restitution_speed.slope={slope}"])
+    write_simulation(tmp_path / "data", SimulationConfig(tracks=50, rate=100.0, seed=3, undeclared=hidden))
+    model = load_model(tmp_path / "data" / "model.yaml")
+    problem = pose(read_dataset(tmp_path / "data"), model, CalibrationConfig(groups="group"))
+    *_, last = calibrate(problem)
+    corrected = pose_correction(problem, last)
+    *_, end = calibrate(corrected)
+    found = finished(corrected, end, errors=False)
+    k = corrected.chosen.names.index("bounce.restitution_speed.slope")
+    sigma = found.step.sigma[k]
+    assert sigma < 0.006
+    assert abs(found.step.mean[k] - slope) < 3.0 * sigma
+    bounce = found.model.bounce["restitution_speed"].values()
+    assert 2.0 < bounce["reference"] < 4.5  # m/s, of the simulated shots
+    mean, doubt = learned(found.model, "drag", *places(found.model))
+    assert np.all(np.abs(mean) < 2.5 * doubt)
 
 
 def test_a_second_correction_is_refused() -> None:

@@ -145,7 +145,7 @@ def test_the_fit_is_that_of_another_solver(made: Predicted) -> None:
     kept[::5] = False
 
     def all_errors(away: np.ndarray) -> np.ndarray:
-        found = [np.sqrt(precision) * (away - about)]
+        found = [np.sqrt(made.numbers.prior(precision)) * (away - about)]
         for here, a, b in zip(kept, made.ends[:-1], made.ends[1:], strict=True):
             if here:
                 errors = made.errors[a:b] + made.slopes[a:b] @ away
@@ -159,6 +159,19 @@ def test_the_fit_is_that_of_another_solver(made: Predicted) -> None:
     np.testing.assert_array_equal(made.fitted(np.inf, about, kept), about)
 
 
+def test_what_the_model_states_holds_whatever_share_of_the_likelihood_counts(
+    windy: Calibrated, made: Predicted
+) -> None:
+    """The precision about the posterior's mean is that of the stated prior and of some share of all tracks together."""
+    problem, last = windy
+    known = problem.model.declared_coefficients()
+    stated = 1.0 / np.square([known[name].sigma for name in problem.chosen.names])
+    every = 1.0 / np.square(last.sigma)
+    for share in (1.0, 0.1, 0.0):
+        own = made.numbers.prior(share)[: len(stated)] / np.square(last.sigma)
+        np.testing.assert_allclose(own, stated + share * (every - stated))
+
+
 def test_the_covariance_is_that_of_tracks_left_out(made: Predicted) -> None:
     """The jackknife: numbers fitted without each track; one of the prior's mean besides."""
     precision, about = 0.1, np.zeros(made.numbers.size)
@@ -168,8 +181,9 @@ def test_the_covariance_is_that_of_tracks_left_out(made: Predicted) -> None:
     names = sorted(set(made.tracks))
     without = [made.fitted(precision, about, kept & (np.array(made.tracks) != name)) for name in names]
     jackknife = (len(names) - 1) / len(names) * sum(np.outer(w - away, w - away) for w in without)
-    inverse = np.linalg.inv(made.weighed(away, kept)[:, :-1, :-1].sum(axis=0) + precision * np.eye(len(away)))
-    prior = precision**2 * inverse @ inverse
+    own = np.diag(made.numbers.prior(precision))
+    inverse = np.linalg.inv(made.weighed(away, kept)[:, :-1, :-1].sum(axis=0) + own)
+    prior = inverse @ own**2 @ inverse
     ratio = np.diag(covariance - prior) / np.diag(jackknife)
     assert np.all((ratio > 0.5) & (ratio < 1.6)), ratio
 
