@@ -97,7 +97,7 @@ def _correction(axes: Axes, model: AnalyticModel, force: str, along: str) -> Non
 
 
 def _restitution(axes: Axes, problem: Problem, last: Step) -> None:
-    """The learned restitution against the normal speed of an impact; its error at the median one is none of the slope's."""
+    """The learned restitution against the normal speed of an impact, with errors of value and slope."""
     middle = cast(Effect, problem.model.bounce[RestitutionSpeed.name]).values()["reference"]
     speed = np.linspace(0.5 * middle, 1.5 * middle, CURVE)
     (e, e_sigma), (slope, slope_sigma) = (
