@@ -44,7 +44,7 @@ HELPERS: Final = ("add_product", "tanh_all")  # Functions of `layers.py` that ge
 
 
 def machine_code(
-    signature: Any, may: Collection[str] = (), *, makes_arrays: bool = True
+    signature: Any, may: Collection[str] = (), *, makes_arrays: bool = True, beside_others: bool = False
 ) -> Callable[[Callable[..., Any]], Any]:
     """Numba's compiler for one signature; kept on disk for other processes.
 
@@ -55,12 +55,13 @@ def machine_code(
         may: what LLVM may do to rounding: "contract", a product and a sum rounded once; "reassoc", sums in any order.
         makes_arrays: False for a function that makes none itself. Numba then does not count who holds those that it is
             given, which takes longer than a short function.
+        beside_others: True to let other threads run Python meanwhile, which takes longer than a short function too.
     """
 
     def declared(function: Callable[..., Any]) -> Any:
         # numba's own error model would look for a zero in every division
         counts: dict[str, Any] = {COUNTS: makes_arrays} if hasattr(DefaultOptions, COUNTS) else {}
-        compiler = njit(error_model="numpy", fastmath=set(may), **counts)
+        compiler = njit(error_model="numpy", fastmath=set(may), nogil=beside_others, **counts)
         dispatcher: Any = compiler(function)
         dispatcher._cache = Kept(function)
 

@@ -34,6 +34,7 @@ from ballfg.estimation.noise.parameters import (
 from ballfg.estimation.noise.profile import Profile
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.parallel.parts import with_jobs
 from ballfg.parallel.work import on_one_thread
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
@@ -128,7 +129,7 @@ def estimate_noise(
             bounces, count as noise too.
         errors: True to compute error bars, which take several times as long.
         watch: called for each track and each step of the search.
-        jobs: processes.
+        jobs: processes, then threads of the search.
     Returns: None if no track is long enough.
     """
     check_model(model, "Load one with load_model.")
@@ -145,8 +146,10 @@ def estimate_noise(
         linear = linearised(model, surfaces, about, parts, watch, jobs=jobs)
         if linear is None:
             return None
-        # the batches are small: threads gain nothing, and slow each other down on a busy machine
-        found = on_one_thread(partial(_searched, parts, settings, known, errors, watch), linear)
+        # torch's batches are small: its threads gain nothing, and slow each other down on a busy machine
+        found = with_jobs(
+            jobs, partial(on_one_thread, partial(_searched, parts, settings, known, errors, watch)), linear
+        )
         jitter = 0.0 if found is None else found.noise.stamp_jitter or 0.0
         kept = float(linear.used.sum()) / sum(len(parts[number]) for number in linear.numbers.astype(int).tolist())
         if kept > 1.0 - MANY or jitter <= about.stamp_jitter * (1.0 + SETTLED):

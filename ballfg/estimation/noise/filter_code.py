@@ -202,7 +202,8 @@ def _join(d, gain, prior, measured, p, work):
 
 
 @machine_code(
-    FLAG(FOUR, THREE, FIVE, TWO, TWO, TWO, FOUR, THREE, INDEX, TWO, TWO, THREE, FOUR, FOUR, FOUR, THREE, TWO, ONE)
+    FLAG(FOUR, THREE, FIVE, TWO, TWO, TWO, FOUR, THREE, INDEX, TWO, TWO, THREE, FOUR, FOUR, FOUR, THREE, TWO, ONE),
+    beside_others=True,
 )
 def filter_tracks(
     transitions, offsets, kicks, process, decays, memory, measured, errors, used, starts, priors,

@@ -110,7 +110,8 @@ def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, t
     NOTHING(
         FOUR, FIVE, TWO, TWO, INDEX, THREE, FOUR, FOUR, FOUR, THREE, TWO,
         THREE, FOUR, ONE, TWO, TWO, TWO, TWO, FOUR,
-    )
+    ),
+    beside_others=True,
 )  # fmt: skip
 def pull_back(
     transitions, kicks, decays, memory, used, means, covariances, gains, roots, weighted, nis,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -12,6 +14,7 @@ from ballfg.estimation.noise.filter_code import NEXT_FROM, filter_tracks
 from ballfg.estimation.noise.filter_derivative import pull_back
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import LEAST_NOISE
+from ballfg.parallel.parts import in_threads, jobs_here
 
 BIAS_DIM: Final = 3
 
@@ -77,6 +80,12 @@ class Filtered:
     steps: tuple[Array, ...]
 
 
+def _of_tracks(code: Callable[..., bool], *arrays: Array) -> list[bool]:
+    """What machine code returns for parts of all tracks (t, ...), each on a thread: tracks do not depend on others."""
+    ends = np.unique(np.linspace(0, len(arrays[0]), jobs_here() + 1).round().astype(int)).tolist()
+    return list(in_threads(lambda part: code(*(one[slice(*part)] for one in arrays)), pairwise(ends)))
+
+
 class LinearFilter:
     """Filters some linearised tracks with any noise.
 
@@ -134,7 +143,7 @@ class LinearFilter:
         made, nll = [np.empty(shape + size) for size in sizes], np.empty(self.count)
         moved = tracks.transitions, tracks.offsets, tracks.kicks
         given = plain(process), decays, plain(memory), plain(measured)
-        if not filter_tracks(*moved, *given, tracks.errors, self.seen, self.first, prior, *made, nll):
+        if not all(_of_tracks(filter_tracks, *moved, *given, tracks.errors, self.seen, self.first, prior, *made, nll)):
             raise np.linalg.LinAlgError("the covariance of an innovation is not positive definite")
         variances = Variances(process, memory, known, measured)
         return Filtered(made[0], made[1], nll, self._scored, variances, decays, tuple(made[2:]))
@@ -155,7 +164,7 @@ class LinearFilter:
         process, decays, memory, prior, measured = found = [np.empty((count, *size)) for size in sizes]
         moved = tracks.transitions, tracks.kicks, filtered.decays, plain(filtered.variances.memory), self.seen
         results = filtered.means, filtered.covariances, *filtered.steps
-        pull_back(*moved, *results, *by_states, np.full(count, by_nll, dtype=np.float64), *found)
+        _of_tracks(pull_back, *moved, *results, *by_states, np.full(count, by_nll, dtype=np.float64), *found)
         memory[:, : self.biases] += prior[:, self.own :]
         return Variances(process, memory, prior[:, : self.own], measured), decays
 

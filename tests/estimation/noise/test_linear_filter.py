@@ -12,6 +12,7 @@ from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.noise.marginal import MarginalFit
 from ballfg.estimation.noise.parameters import parameters_of
+from ballfg.parallel.parts import with_jobs
 from ballfg.simulation import MeasurementNoise
 from tests.estimation.noise import in_torch
 
@@ -92,6 +93,21 @@ def test_losses_change_by_the_integral_of_their_derivative(linear):
     step = scales[1] - scales[0]
     simpson = step / 3.0 * (slopes[:-2:2] + 4.0 * slopes[1:-1:2] + slopes[2::2])
     np.testing.assert_allclose(simpson, np.diff(total[::2], axis=0), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("jobs", [2, 3, 9])
+def test_threads_change_no_bit(linear, jobs):
+    """Two and more tracks a thread, and more threads than tracks."""
+
+    def run(tracks):
+        noise = noise_of(4)
+        found = tracks.run(noise, tracks.measured(noise))
+        by, decays = tracks.slopes(found, 0.7, (found.means, found.covariances))
+        return found.means, found.covariances, found.nll, by.process, by.memory, by.prior, by.measured, decays
+
+    tracks = LinearFilter(linear, 10.0)
+    for one, several in zip(run(tracks), with_jobs(jobs, run, tracks), strict=True):
+        np.testing.assert_array_equal(one, several)
 
 
 def test_a_covariance_that_is_none_is_refused(linear):
