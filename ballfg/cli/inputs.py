@@ -209,12 +209,13 @@ def open_inputs(
     from ballfg.estimation import dataset_surfaces
     from ballfg.estimation.batch import start_early
     from ballfg.estimation.reading import with_readings
+    from ballfg.parallel.parts import jobs_here
     from ballfg.tracks import read_dataset
 
     know(effects_files)
     data = with_readings(read_dataset(dataset))
     found, doubts = _opened(data, model, ball)
-    start_early(len(data))
+    start_early(len(data), jobs_here())
     return Inputs(data, found, dataset_surfaces(data), observed, doubts)
 
 

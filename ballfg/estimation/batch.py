@@ -12,7 +12,7 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.flights.estimates import estimated
 from ballfg.estimation.result import Estimate
 from ballfg.parallel.executor import executor
-from ballfg.parallel.parts import jobs_here, with_jobs
+from ballfg.parallel.parts import with_jobs
 from ballfg.parallel.processes import Processes
 from ballfg.parallel.stream import finished, in_order
 from ballfg.parallel.work import each, on_one_thread
@@ -25,7 +25,7 @@ PROBED = 9  # Tracks that are done in this process first, to time one
 START_UP = 5.0
 """s until worker processes help (they import torch and gtsam): less work stays in this process. Many short calls count
 together: none of them is worth it by itself."""
-MANY = 500  # Tracks that usually take as long: 10 ms each
+MANY = 500  # Estimates that usually take as long: 10 ms each
 _spent = 0.0  # s of work so far that worker processes could have shared, had they been there
 
 
@@ -49,9 +49,9 @@ def _without_world(made: Callable[[Track], Estimate], track: Track) -> Estimate:
     return replace(made(track), world=None)
 
 
-def start_early(count: int) -> None:
-    """Starts the processes for many tracks: they load their libraries while this one finds flights and noise."""
-    others = executor(jobs_here())
+def start_early(count: int, jobs: int) -> None:
+    """Starts the processes for many estimates: they load their libraries while this one does what comes first."""
+    others = executor(jobs)
     if isinstance(others, Processes) and count >= MANY and not others.started:
         others.start(__name__)
 

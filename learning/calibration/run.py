@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from ballfg.checks import shown
 from ballfg.dynamics import save_model
 from ballfg.dynamics.model_file import model_to_dict
+from ballfg.estimation.batch import start_early
 from ballfg.files.damaged import whole_content
 from ballfg.learning.calibration.auto import (
     CORRECTED,
@@ -48,6 +49,8 @@ from ballfg.learning.training_data import analytic_model, open_source
 from ballfg.progress import Watch
 from ballfg.tracks.noise import TrackNoise
 
+ESTIMATES: Final = 40  # Of each track that a choice takes, about
+
 
 class Checkpoint(Plain):
     """The checkpoint of a calibration, from which it continues to the same numbers."""
@@ -76,6 +79,7 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         problem = pose(dataset, model, config, config.jobs or jobs)
         if config.kind == AUTO:
             check_enough(problem.split.fit)
+            start_early(ESTIMATES * len(problem.split.fit), problem.jobs)
         if not resume:
             files.start(folder, config)
         fit, judge = len(problem.split.fit), len(problem.split.judge)
