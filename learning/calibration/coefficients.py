@@ -36,11 +36,18 @@ class Chosen:
     high: Array
     shared: tuple[str, ...] = ()
     """Those that all tracks share, without spread between them: the weights of a correction."""
+    steady: tuple[str, ...] = ()
+    """Others without a spread, which reports list: the slope of the restitution beside a correction."""
 
     @property
     def alike(self) -> Index:
         """Numbers of the shared ones."""
         return np.array([self.names.index(name) for name in self.shared], dtype=np.int64)
+
+    @property
+    def without_spread(self) -> Index:
+        """Numbers of the shared and of the steady ones."""
+        return np.array([k for k, name in enumerate(self.names) if name in self.shared + self.steady], dtype=np.int64)
 
     @property
     def listed(self) -> list[tuple[int, str]]:

@@ -188,7 +188,7 @@ def with_weights(model: AnalyticModel, chosen: Chosen, *, labelled: bool) -> Cho
     Args: labelled: True if tracks have spin labels, which tell a larger lift from a larger spin.
     """
     shared = ALL if labelled else DRAG
-    slope = [SLOPE] if SLOPE in model.declared_coefficients() and SLOPE not in chosen.names else []
+    slope = (SLOPE,) if SLOPE in model.declared_coefficients() and SLOPE not in chosen.names else ()
     further = choose(model, (*slope, *shared))
     if SCALE in chosen.names:
         k, start, sigma = chosen.names.index(SCALE), chosen.start.copy(), chosen.sigma.copy()
@@ -196,4 +196,6 @@ def with_weights(model: AnalyticModel, chosen: Chosen, *, labelled: bool) -> Cho
         chosen = replace(chosen, start=start, sigma=sigma)
     pairs = {name: (getattr(chosen, name), getattr(further, name)) for name in ("start", "sigma", "low", "high")}
     names, units = chosen.names + further.names, chosen.units + further.units
-    return Chosen(names, units, **{name: np.concatenate(pair) for name, pair in pairs.items()}, shared=shared)
+    return Chosen(
+        names, units, **{name: np.concatenate(pair) for name, pair in pairs.items()}, shared=shared, steady=slope
+    )

@@ -148,17 +148,18 @@ class Groups:
             (p,) standard deviations of a new track's coefficients about the mean of its group.
         """
         columns, numbers, size = self.beside(chosen), self.numbers(tracks, chosen), len(chosen.names)
-        columns, best = _widest(evidences, columns, numbers, chosen.alike)
+        columns, best = _widest(evidences, columns, numbers, chosen.alike, chosen.without_spread)
         shared = best
         own = np.array([self._number(name) for name in tracks])
         apart: dict[str, int] = {}
-        for k, name in chosen.listed if len(self.names) > 1 else ():
+        varied = [pair for pair in chosen.listed if pair[1] not in chosen.steady]
+        for k, name in varied if len(self.names) > 1 else ():
             first = len(columns[0])
             split = numbers.copy()
             split[:, k] = first + own
             start, sigma, low, high = (np.append(values, np.full(len(self.names), values[k])) for values in columns)
             wider = (start, sigma, low, high)
-            found = fit_population(evidences, *wider, split, chosen.alike)
+            found = fit_population(evidences, *wider, split, chosen.without_spread)
             if found.log_likelihood - best.log_likelihood > (len(self.names) - 1) * np.log(len(tracks)):
                 best, columns, numbers, apart[name] = found, wider, split, first
         next_track = np.sqrt((best.next_track[numbers[:, :size]] ** 2).mean(axis=0))
@@ -198,7 +199,7 @@ class Groups:
 
 
 def _widest(
-    evidences: Sequence[Evidence], columns: Columns, numbers: Index, alike: Index
+    evidences: Sequence[Evidence], columns: Columns, numbers: Index, alike: Index, without_spread: Index
 ) -> tuple[Columns, Population]:
     """The population, and its columns with the priors of the shared coefficients that have the largest evidence.
 
@@ -212,7 +213,9 @@ def _widest(
     for widths in product(WIDTHS, repeat=len(forces)):
         own = sigma.copy()
         own[forces] = np.array(widths)[:, None]
-        tried.append(((start, own, low, high), fit_population(evidences, start, own, low, high, numbers, alike)))
+        tried.append(
+            ((start, own, low, high), fit_population(evidences, start, own, low, high, numbers, without_spread))
+        )
     evidence_of = np.array([found.log_evidence for _, found in tried])
     share = np.exp(evidence_of - evidence_of.max())
     share /= share.sum()

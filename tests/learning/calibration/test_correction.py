@@ -203,7 +203,7 @@ def test_the_width_of_the_prior_is_averaged_by_its_evidence() -> None:
     noise, measured = 0.1, 0.1 * rng.normal(size=count)
     one = Evidence(np.eye(count) / noise**2, measured / noise**2, np.zeros(count))
     columns = (np.zeros(count), np.ones(count), np.full(count, -9.0), np.full(count, 9.0))
-    _, found = _widest([one], columns, np.arange(count)[None], np.arange(count))
+    _, found = _widest([one], columns, np.arange(count)[None], np.arange(count), np.arange(count))
     widths = np.array(WIDTHS)
     spreads = np.hypot(noise, widths)[:, None]
     share = np.exp(stats.norm.logpdf(measured, 0.0, spreads).sum(axis=1))
@@ -256,6 +256,8 @@ def test_a_restitution_that_falls_with_speed_is_not_the_airs(tmp_path: Path) -> 
     sigma = found.step.sigma[k]
     assert sigma < 0.006
     assert abs(found.step.mean[k] - slope) < 3.0 * sigma
+    assert found.step.spread[k] == 0.0  # one ball and one table
+    assert found.step.next_track[k] == pytest.approx(sigma)
     bounce = found.model.bounce["restitution_speed"].values()
     assert 2.0 < bounce["reference"] < 4.5  # m/s, of the simulated shots
     mean, doubt = learned(found.model, "drag", *places(found.model))
