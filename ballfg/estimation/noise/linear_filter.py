@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array, plain
+from ballfg.arrays import Array, Index, plain
 from ballfg.estimation.noise.filter_code import NEXT_FROM, filter_tracks
 from ballfg.estimation.noise.filter_derivative import pull_back
 from ballfg.estimation.noise.linear_tracks import LinearTracks
@@ -80,7 +80,7 @@ class Filtered:
     steps: tuple[Array, ...]
 
 
-def _of_tracks(code: Callable[..., bool], *arrays: Array) -> list[bool]:
+def _of_tracks(code: Callable[..., bool], *arrays: Array | Index) -> list[bool]:
     """What machine code returns for parts of all tracks (t, ...), each on a thread: tracks do not depend on others."""
     ends = np.unique(np.linspace(0, len(arrays[0]), jobs_here() + 1).round().astype(int)).tolist()
     return list(in_threads(lambda part: code(*(one[slice(*part)] for one in arrays)), pairwise(ends)))
