@@ -15,7 +15,7 @@ from ballfg.estimation.segmentation.result import Contact
 from ballfg.factors.linear.definite import joint_covariance
 from ballfg.prediction.forecast import Forecast
 from ballfg.prediction.state import BallState, World
-from ballfg.state import CORRELATIONS, SIGMA_NAMES, STATE_DIM, STATE_NAMES
+from ballfg.state import CORRELATIONS, SIGMA_NAMES, STATE_DIM, STATE_NAMES, VZ
 
 if TYPE_CHECKING:
     import gtsam
@@ -146,6 +146,11 @@ class Estimate:
             if np.shape(getattr(self, name)) != shape:
                 got = np.shape(getattr(self, name))
                 raise ValueError(f"{name} of an Estimate must have shape {shape}; got {got}. Give one a stamp.")
+
+    @property
+    def falls(self) -> Array:
+        """(c,) m/s, how fast the ball falls at the last sample before each contact."""
+        return -self.states[[contact.interval for contact in self.contacts], VZ]
 
     def __len__(self) -> int:
         return len(self.times)

@@ -61,7 +61,8 @@ def in_parts(function: Callable[[T], R], parts: Sequence[T], together: int) -> I
 def in_threads(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """A function of each item of a stream, in order, a few ahead: on as many threads as `with_jobs` has processes.
 
-    For large items and functions of libraries that let other threads run meanwhile, such as OpenCV's of pictures.
+    For large items and functions that let other threads run meanwhile, such as OpenCV's of pictures, or machine code
+    that is compiled `beside_others`.
 
     Raises: the function's exceptions.
     """

@@ -51,7 +51,7 @@ class Chosen:
 
     @property
     def listed(self) -> list[tuple[int, str]]:
-        """Number and name of those that differ between tracks, which reports list."""
+        """Number and name of those that are not shared, which reports list."""
         return [(k, name) for k, name in enumerate(self.names) if name not in self.shared]
 
     @property

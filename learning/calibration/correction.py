@@ -29,7 +29,7 @@ from ballfg.dynamics.effects.generic import (
 from ballfg.estimation import Estimate, Status
 from ballfg.learning.calibration.coefficients import Chosen, choose, values_of
 from ballfg.learning.calibration.groups import GroupSpin
-from ballfg.state import SPIN, VELOCITY, VZ
+from ballfg.state import SPIN, VELOCITY
 
 SECTION: Final = f"flight.{AirCorrection.name}"
 DRAG: Final = tuple(f"{SECTION}.{name}" for name in WEIGHTS if name.startswith("drag"))  # Names of the weights of drag
@@ -113,7 +113,7 @@ def with_correction(
     carried = [f"{DOUBT[force]}_{k}" for force in FORCES[: 1 + labelled] for k in range(1, DOUBTS + 1)]
     effect.set_sigmas(**dict.fromkeys(WEIGHTS, LINEAR), **dict.fromkeys(carried, 1.0))
     effects = [*copy.deepcopy(model.effects), effect]
-    falls = -np.array([one.states[contact.interval, VZ] for one in found for contact in one.contacts])
+    falls = np.concatenate([estimate.falls for estimate in found])
     falls = falls[falls > 0.0]
     if len(falls) and Restitution.name in model.bounce and RestitutionSpeed.name not in model.bounce:
         slope = RestitutionSpeed(slope=0.0, reference=float(np.median(falls)))

@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from ballfg.arrays import Array
 from ballfg.checks import drawn
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Effect
@@ -85,8 +86,7 @@ def _correction(axes: Axes, model: AnalyticModel, force: str, along: str) -> Non
     at = middle | {along: np.linspace(max(low - 0.3 * (high - low), 0.0), high + 0.3 * (high - low), CURVE)}
     mean, sigma = (100.0 * values for values in learned(model, force, at["speed"], at["ratio"]))
     axes.axvspan(low, high, color=START, alpha=0.12, linewidth=0, label="90 % of the samples")
-    axes.fill_between(at[along], mean - NINETY * sigma, mean + NINETY * sigma, color=BAND, alpha=0.25, linewidth=0)
-    axes.plot(at[along], mean, color=BAND, linewidth=1.5, label="learned, with its 90 % band")
+    _band(axes, at[along], mean, sigma)
     axes.axhline(0.0, color=START, linestyle="--", linewidth=1.0, label="declared law")
     (other,) = set(AXES) - {along}
     words, _, unit = AXES[other].partition(", ")
@@ -94,6 +94,12 @@ def _correction(axes: Axes, model: AnalyticModel, force: str, along: str) -> Non
     axes.set(xlabel=AXES[along], ylabel=f"correction of {force}, %")
     axes.grid(visible=True, alpha=0.25)
     axes.legend(fontsize="x-small")
+
+
+def _band(axes: Axes, along: Array, mean: Array, sigma: Array) -> None:
+    """A learned curve with its 90 % band."""
+    axes.fill_between(along, mean - NINETY * sigma, mean + NINETY * sigma, color=BAND, alpha=0.25, linewidth=0)
+    axes.plot(along, mean, color=BAND, linewidth=1.5, label="learned, with its 90 % band")
 
 
 def _restitution(axes: Axes, problem: Problem, last: Step) -> None:
@@ -105,8 +111,7 @@ def _restitution(axes: Axes, problem: Problem, last: Step) -> None:
     )
     mean, sigma = e - slope * (speed - middle), np.hypot(e_sigma, slope_sigma * (speed - middle))
     axes.axvline(middle, color=START, alpha=0.5, linewidth=1.0, label="median impact")
-    axes.fill_between(speed, mean - NINETY * sigma, mean + NINETY * sigma, color=BAND, alpha=0.25, linewidth=0)
-    axes.plot(speed, mean, color=BAND, linewidth=1.5, label="learned, with its 90 % band")
+    _band(axes, speed, mean, sigma)
     axes.set(xlabel="normal speed of the impact, m/s", ylabel="restitution")
     axes.set_title("restitution against speed", size=10)
     axes.grid(visible=True, alpha=0.25)

@@ -90,13 +90,18 @@ class Numbers:
         """How many they are."""
         return len(self.coefficients) + 3 * len(self.last.spins) + len(self.directions)
 
+    @cached_property
+    def stated(self) -> Array:
+        """(p,) precisions that the model itself states, zero for those without a coefficient."""
+        known = self.problem.model.declared_coefficients()
+        sigmas = np.array([known[name].sigma for _, name in self.problem.chosen.listed])
+        found = np.zeros(self.size)
+        found[: len(sigmas)] = np.minimum(np.array(self.last.sigma)[self.coefficients] / sigmas, 1.0) ** 2
+        return found
+
     def prior(self, precision: float) -> Array:
         """(p,) precisions about the most probable numbers, with some share of what the likelihood gives them."""
-        known = self.problem.model.declared_coefficients()
-        stated = np.array([known[name].sigma for _, name in self.problem.chosen.listed])
-        held = np.zeros(self.size)
-        held[: len(stated)] = np.minimum(np.array(self.last.sigma)[self.coefficients] / stated, 1.0) ** 2
-        return held + precision * (1.0 - held)
+        return self.stated + precision * (1.0 - self.stated)
 
     def bounds(self) -> tuple[Array, Array]:
         """(p,) each."""

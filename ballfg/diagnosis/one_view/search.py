@@ -20,7 +20,7 @@ from ballfg.diagnosis.one_view.weights import Set, Weights, mean_of, odds_of, sl
 from ballfg.dynamics import AnalyticModel, Surfaces
 from ballfg.dynamics.effect import Effect, Scene, Vector
 from ballfg.estimation import Settings
-from ballfg.state import POSITION, VELOCITY, VZ
+from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks.track import Track
 
 LEAST: Final = 20  # Strokes. With fewer, the scatter of as many scores from stroke to stroke is hardly known
@@ -239,8 +239,8 @@ def _scene(strokes: Sequence[Stroke]) -> Scene:
     """The extent of strokes."""
     states = np.concatenate([stroke.estimate.states for stroke in strokes])
     places = states[:, POSITION]
-    falls = [float(-stroke.estimate.states[c.interval, VZ]) for stroke in strokes for c in stroke.estimate.contacts]
+    falls = np.concatenate([stroke.estimate.falls for stroke in strokes])
     extent = (places.min(axis=0), places.max(axis=0), np.median(places, axis=0))
     low, high, middle = (cast(Vector, tuple(place.tolist())) for place in extent)
     speed = float(np.median(np.linalg.norm(states[:, VELOCITY], axis=1)))
-    return Scene(low, high, middle, speed, float(np.median(falls)) if falls else float("nan"), len(falls), 0)
+    return Scene(low, high, middle, speed, float(np.median(falls)) if len(falls) else float("nan"), len(falls), 0)
